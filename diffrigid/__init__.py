@@ -1,0 +1,62 @@
+"""diffrigid: differentiable rigid bodies in JAX, from measured motion to physical parameters.
+
+Letters of array axes, everywhere: N bodies, D space (2 or 3), A angular (1 or 3), Q orientation (2 or 4),
+S statics, C contacts, P pairs, K contacts of a pair, T time steps; trailing batch axes follow them.
+"""
+
+from diffrigid.batch import rollout_batch
+from diffrigid.contact import Contact
+from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
+from diffrigid.pytree import replace
+from diffrigid.scene import Body, Static, scene
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Sphere
+from diffrigid.state import (
+    State,
+    Wrench,
+    angular_momentum,
+    kinetic_energy,
+    material_point,
+    material_velocity,
+    momentum,
+)
+from diffrigid.step import Trajectory, rollout, step
+from diffrigid.sysid import Fit, fit, interval, positive, real
+from diffrigid.world import World, check
+
+__all__ = [
+    "Body",
+    "Box",
+    "Capsule",
+    "Contact",
+    "Disc",
+    "Drag",
+    "Fit",
+    "Force",
+    "Gravity",
+    "HalfSpace",
+    "Hull",
+    "Polygon",
+    "Sphere",
+    "SpringDamper",
+    "State",
+    "Static",
+    "Torque",
+    "Trajectory",
+    "World",
+    "Wrench",
+    "angular_momentum",
+    "check",
+    "fit",
+    "interval",
+    "kinetic_energy",
+    "material_point",
+    "material_velocity",
+    "momentum",
+    "positive",
+    "real",
+    "replace",
+    "rollout",
+    "rollout_batch",
+    "scene",
+    "step",
+]

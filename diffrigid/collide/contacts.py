@@ -1,0 +1,14 @@
+"""The record that every pair function returns."""
+
+from jax import Array
+
+from diffrigid.pytree import array, pytree
+
+
+@pytree
+class Contacts:
+    """K contacts of one pair of shapes a and b, world frame."""
+
+    gap: Array = array("K")  # (K, *batch) [m] signed distance, negative in penetration
+    normal: Array = array("K", "D")  # (K, D, *batch) [-] unit, from b to a
+    point: Array = array("K", "D")  # (K, D, *batch) [m] midway between the two surfaces

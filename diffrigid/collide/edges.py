@@ -1,0 +1,131 @@
+"""Edges of two convex shapes in space that cross: planks that lie across each other, and edges that meet.
+
+Of all pairs of edges the few that can touch are chosen without gradient, and evaluated with it.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from diffrigid import so3
+from diffrigid.collide.contacts import Contacts
+from diffrigid.numerics import dot, normalise, safe_divide, unit_vector
+from diffrigid.shapes import Capsule, edge_apexes, edges, radius
+
+FAR = 1e6  # [m] gap of a crossing that does not exist
+CROSSINGS = 8  # at most: of two rectangles face to face
+PARALLEL = 1e-3  # [rad] edges closer to parallel than this do not cross
+ALIKE = 0.5  # cosine: contacts of convex bodies that touch have one normal, up to their penetration
+
+
+class Edges(NamedTuple):
+    """E edges in the world, their axis behind that of components: XLA vectorises the last."""
+
+    start: Array  # (3, E, *batch) [m]
+    along: Array  # (3, E, *batch) [m] from start to end
+    left: Array  # (3, E, *batch) [m] from start to a corner of the face on one side
+    right: Array  # (3, E, *batch) [m] and of the face on the other
+
+
+def crossing_edges(
+    a, corners_a: Array, b, corners_b: Array, contacts: Contacts, separated: Array, slack: Array
+) -> Contacts:
+    """Contacts where edges cross, 1 to CROSSINGS of them; those that do not exist are FAR apart.
+
+    Args:
+        corners_a, corners_b: (V, 3, *batch) [m] in the world.
+        contacts: those of the corners; where one touches, its normal is that of the crossings as well.
+        separated: (*batch) bool: one of them shows that the bodies do not overlap.
+    """
+    edges_a, edges_b = _edges(a, corners_a), _edges(b, corners_b)
+    size_a, size_b = edges_a.start.shape[1], edges_b.start.shape[1]
+    # The barrier keeps XLA from placing the edges anew for each of their pairs.
+    rows, columns, margin = lax.optimization_barrier(lax.stop_gradient((edges_a, edges_b, slack)))
+    rows, columns = Edges(*(leaf[:, :, None] for leaf in rows)), Edges(*(leaf[:, None] for leaf in columns))
+    order = _order(_crossing(rows, columns, margin[None, None]), separated, margin[None, None])
+    order = jnp.moveaxis(order.reshape(size_a * size_b, *slack.shape), 0, -1)
+    count = (CROSSINGS, 2, 1)[isinstance(a, Capsule) + isinstance(b, Capsule)]
+    nearest, index = (jnp.moveaxis(leaf, -1, 0) for leaf in lax.top_k(-order, count))
+
+    def pick(of: Edges, row: Array) -> Edges:
+        chosen = jax.nn.one_hot(row, of.start.shape[1], axis=0, dtype=of.start.dtype)
+        return Edges(*((chosen[None] * leaf).sum(1) for leaf in of))
+
+    def one(row):
+        return _crossing(pick(edges_a, row // size_b), pick(edges_b, row % size_b), slack)
+
+    chosen = jax.vmap(one)(index)
+    exists = (nearest > -FAR) & _along_contact(chosen, contacts, slack)
+    gap = jnp.where(exists, chosen.distance - (radius(a) + radius(b))[None], FAR)
+    shift = (radius(b) - radius(a))[None, None] * chosen.normal  # from between the cores to between the surfaces
+    middle = 0.5 * (chosen.on_a + chosen.on_b + shift)
+    return Contacts(gap=gap, normal=chosen.normal, point=middle)
+
+
+def _edges(shape, corners: Array) -> Edges:
+    ends, beside = np.array(edges(shape, 3)), np.array(edge_apexes(shape, 3))
+    start, end, left, right = (jnp.swapaxes(corners[i], 0, 1) for i in (*ends.T, *beside.T))
+    return Edges(start, end - start, left - start, right - start)
+
+
+class Crossing(NamedTuple):
+    """Two edges where they are closest: the normal is their common perpendicular, away from b."""
+
+    distance: Array  # (*batch) [m] from the edge of b to that of a along the normal
+    normal: Array  # (3, *batch)
+    on_a: Array  # (3, *batch) [m]
+    on_b: Array
+    within: Array  # (*batch) bool: both points are inside their edges
+    outermost: Array  # (*batch) bool: along the normal, both edges are where their shapes end
+
+
+def _crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
+    """Closest points of two lines, from 2 x 2 normal equations, and whether their shapes may touch there.
+
+    They may if the faces beside both edges fall away from the normal (arcs that cross in the Gauss map).
+    Source: Ericson, Real-Time Collision Detection, 5.1.9; Gregorius, The separating axis test, GDC 2013.
+    """
+    aa, bb, ab = dot(a.along, a.along), dot(b.along, b.along), dot(a.along, b.along)
+    between = a.start - b.start
+    ra, rb = dot(a.along, between), dot(b.along, between)
+    det = aa * bb - ab * ab
+    share_a, share_b = safe_divide(ab * rb - bb * ra, det), safe_divide(aa * rb - ab * ra, det)
+    within = (det > PARALLEL**2 * aa * bb) & (share_a > 0) & (share_a < 1) & (share_b > 0) & (share_b < 1)
+    on_a, on_b = a.start + share_a[None] * a.along, b.start + share_b[None] * b.along
+    n = normalise(so3.cross(a.along, b.along), fallback=unit_vector(between, -1))
+    sides = dot(n, a.left), dot(n, a.right), -dot(n, b.left), -dot(n, b.right)  # [m] all on one side of zero
+    behind = sides[0] + sides[1] + sides[2] + sides[3]
+    towards = jnp.where(jnp.abs(behind) > slack, behind, dot(n, on_a - on_b))  # two capsules have no faces
+    sign = jnp.where(towards >= 0, 1.0, -1.0).astype(n.dtype)
+    lowest = jnp.minimum(jnp.minimum(sign * sides[0], sign * sides[1]), jnp.minimum(sign * sides[2], sign * sides[3]))
+    n = sign[None] * n
+    return Crossing(dot(n, on_a - on_b), n, on_a, on_b, within, lowest >= -slack)
+
+
+def _order(c: Crossing, separated: Array, slack: Array) -> Array:
+    """How far the edges of all crossings are from touching, (E, E, *batch) [m]; FAR if they cannot touch.
+
+    A positive distance is that of two points of the bodies, so it is no less than theirs. A negative one is
+    penetration only if nothing separates the bodies.
+    """
+    apart = c.distance > slack
+    separated = separated | (c.within & c.outermost & apart).any((0, 1))
+    return jnp.where(c.within & (apart | (c.outermost & ~separated[None, None])), jnp.abs(c.distance), FAR)
+
+
+def _along_contact(c: Crossing, contacts: Contacts, slack: Array) -> Array:
+    """Whether K crossings, nearest first, are apart, or along the normal of the bodies where they touch.
+
+    That is the normal of the deepest corner or, if none touches, of the nearest crossing that is not apart.
+    """
+    apart = c.distance > slack[None]
+
+    def pick(index, normals):
+        return (jax.nn.one_hot(index, len(normals), axis=0, dtype=slack.dtype)[:, None] * normals).sum(0)
+
+    corner, crossing = pick(jnp.argmin(contacts.gap, 0), contacts.normal), pick(jnp.argmin(apart, 0), c.normal)
+    normal = lax.stop_gradient(jnp.where((contacts.gap.min(0) <= slack)[None], corner, crossing))
+    return apart | (jax.vmap(dot, in_axes=(0, None))(c.normal, normal) > ALIKE)

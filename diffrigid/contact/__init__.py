@@ -1,0 +1,5 @@
+"""The contact model: exact impacts at their true times within a step, smooth ones for width > 0, and rest."""
+
+from diffrigid.contact.model import Contact
+
+__all__ = ["Contact"]

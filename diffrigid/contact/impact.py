@@ -1,0 +1,254 @@
+"""When two colliders meet within a step, on their true paths, and where.
+
+The time is found without derivatives, by a closed form for round shapes and a search for the rest, and then
+given the derivative of the implicit function theorem (`implicit_root`). Everything else, normal, arms and
+speeds, is evaluated *at* that time, and so follows it.
+
+Smoothing is put into the distance, not into time: with `width` > 0 an impact happens at the distance
+
+    level = width * softplus(gap_min / width),     gap_min: closest approach of the predicted paths
+
+which is Newton's law at a slightly larger distance: it keeps momentum, makes no energy, leaves full hits
+(gap_min far below zero) as they are, and lets a near miss pull.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.collide import Contacts
+from diffrigid.contact.sides import (
+    Side,
+    centre,
+    contacts_of,
+    gap_rates,
+    place,
+    reach_of,
+    relative_acceleration,
+)
+from diffrigid.numerics import dot, implicit_root, norm, safe_divide, safe_sqrt, softplus
+from diffrigid.shapes import Disc, HalfSpace, Sphere
+from diffrigid.state import rotations
+
+ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
+POLISH = 6  # steps along the local parabola of the gap; error squared by each
+NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over to polishing
+
+
+def find_impact(
+    a: Side, b: Side, t1: Array, width: Array, straight: bool, rest_speed: Array, at_end: Array
+) -> tuple[Array, Array, Array, Array]:
+    """First impact of one pair before t1, or the end of the step itself.
+
+    Args:
+        t1: (*batch) [s] end of the step.
+        width: (*batch) [m] of the smooth distance; 0 is exact.
+        straight: all bodies have the same acceleration, so relative paths are straight lines.
+        rest_speed: (*batch) [m/s] slower impacts do not move their time with the parameters.
+        at_end: bool; True: do not look for an impact, s is t1.
+
+    Returns:
+        s (*batch) [s]; hit (*batch) bool, it happens before t1; level (*batch) [m] of the gap at which it
+        happens; slack (*batch) [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size.
+
+    Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
+    """
+    s0, level, found = _approach(a, b, t1, width, straight)
+    hit = found & (s0 <= t1) & ~at_end
+    s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
+    slack = jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.minimum(reach_of(a), reach_of(b))
+    at_a, at_b = place(a, s0), place(b, s0)
+    moved = contacts_of(a, at_a, b, at_b)
+    gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
+    closing = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
+    share = closing.astype(s0.dtype) / jnp.maximum(closing.sum(0), 1)[None].astype(s0.dtype)
+    s = implicit_root(s0, (share * moved.gap).sum(0) - level, (share * speed).sum(0))
+    return s, hit | at_end, level, slack
+
+
+def _approach(a: Side, b: Side, t1, width, straight) -> tuple[Array, Array, Array]:
+    """Time of the impact (no gradient), level of the gap at which it happens, and whether there is one."""
+    is_round = isinstance(a.shape, Disc | Sphere)
+    if is_round and isinstance(b.shape, Disc | Sphere) and straight:
+        return _approach_straight(a, b, width)
+    if is_round and isinstance(b.shape, HalfSpace):
+        return _approach_parabola(a, b, width)
+    return _approach_search(a, b, t1, width)
+
+
+def _earliest(a: Side, b: Side) -> tuple[Array, Array]:
+    """Time from which both paths hold, and how far back a late impact may be repaired."""
+    if b.flight is None or a.flight is None:
+        side = a if b.flight is None else b
+        return side.flight.t0, side.since
+    return jnp.maximum(a.flight.t0, b.flight.t0), jnp.maximum(a.since, b.since)
+
+
+def _approach_straight(a: Side, b: Side, width: Array) -> tuple[Array, Array, Array]:
+    """Two round shapes whose relative path is a line: |P + W s| = R + level.
+
+    With D = (P.W)^2 - W^2 (P^2 - R^2), smooth: D -> eps softplus(D / eps), eps = 2 R W^2 width, and the
+    distance at impact is the Rs >= R that this D belongs to.
+    """
+    start, bound = _earliest(a, b)
+    (x_a, v_a), (x_b, v_b) = centre(a, start), centre(b, start)
+    P, W = x_a - x_b, v_a - v_b
+    R = a.shape.radius + b.shape.radius
+    W2, closing, excess = dot(W, W), -dot(P, W), dot(P, P) - R * R
+    D_exact = closing * closing - W2 * excess
+
+    def smooth(D):
+        return softplus(D, 2.0 * R * W2 * width)
+
+    D = lax.cond(jnp.any(width > 0), smooth, lambda D: jnp.maximum(D, 0.0), D_exact)
+    raised = safe_divide(D - D_exact, W2)
+    level = safe_sqrt(R * R + raised) - R
+    s = start + safe_divide(excess - raised, closing + safe_sqrt(D))
+    found = (closing > 0) & (D > 0)
+    return jnp.where(s < bound, start, s), level, found
+
+
+def _approach_parabola(a: Side, b: Side, width: Array) -> tuple[Array, Array, Array]:
+    """A round shape and a half-space at rest: gap(s) = gap + v s + acc s^2 / 2, exactly."""
+    so, (start, bound) = rotations(a.flight.dim), _earliest(a, b)
+    normal = so.rotate(b.q, b.shape.normal)
+    x, velocity = centre(a, start)
+    gap = dot(normal, x - b.x) - b.shape.offset - a.shape.radius
+    v, acc = dot(normal, velocity), dot(normal, a.flight.a)
+    turns_back = acc > 0
+    gap_min = gap - 0.5 * safe_divide(v * v, jnp.where(turns_back, acc, 0.0))
+
+    def smooth(gap_min):
+        return jnp.where(turns_back, softplus(gap_min, width), 0.0)
+
+    level = lax.cond(jnp.any(width > 0), smooth, jnp.zeros_like, gap_min)
+    height = gap - level
+    root = safe_sqrt(v * v - 2.0 * acc * height)
+    later = safe_divide(v + root, -acc)  # on the way up: the way down
+    sooner = safe_divide(2.0 * height, root - v)
+    s = start + jnp.where(v > 0, later, sooner)
+    # Below the surface and sinking, with no crossing in the past: the impact is now.
+    sunk = (height < 0) & (v * v < 2.0 * acc * height)
+    found = jnp.where(turns_back, (v < 0) & (root > 0), (v < 0) | (acc < 0)) | sunk
+    return jnp.where(sunk | (s < bound), start, s), level, found
+
+
+def _approach_search(a: Side, b: Side, t1: Array, width: Array) -> tuple[Array, Array, Array]:
+    """Any two shapes: conservative advancement to the neighbourhood, then the parabola of the next contact."""
+    start, bound = _earliest(a, b)
+    frozen_a, frozen_b = lax.stop_gradient((a, b))
+    size = jnp.minimum(reach_of(a), reach_of(b))
+    near = _advance(frozen_a, frozen_b, start, t1, NEAR * size)
+    level = lax.cond(
+        jnp.any(width > 0),
+        lambda: _closest_level(a, b, near, t1 - start, width),
+        lambda: jnp.zeros_like(near),
+    )
+    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size)
+    return jnp.where(s < bound, start, s), level, found
+
+
+def _motion(a: Side, b: Side, s: Array) -> tuple[Contacts, Array, Array]:
+    """Contacts at s, the rates of their gaps, (K, *batch) [m/s], and the accelerations of them [m/s^2]."""
+    at_a, at_b = place(a, s), place(b, s)
+    contacts = contacts_of(a, at_a, b, at_b)
+
+    def pull(n, p):
+        return dot(n, relative_acceleration(at_a, at_b, p))
+
+    return contacts, gap_rates(contacts, at_a, at_b), jax.vmap(pull)(contacts.normal, contacts.point)
+
+
+def _time_to(height: Array, v: Array, acc: Array) -> Array:
+    """Time until height + v t + acc t^2 / 2 next falls through zero; negative if inside and closing; inf: never."""
+    D = v * v - 2.0 * acc * height
+    root = safe_sqrt(D)
+    closing = jnp.where((D < 0) & (height > 0), jnp.inf, safe_divide(2.0 * height, root - v))
+    returning = jnp.where(acc < 0, safe_divide(v + root, -acc), jnp.inf)
+    sunk = (height < 0) & (acc < 0) & (D < 0)
+    return jnp.where(sunk, 0.0, jnp.where(v < 0, closing, returning))
+
+
+def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
+    """Advance until a contact is within `near` and closing, or the step is over.
+
+    Each advance is the least, over the contacts, of the gap over a bound on the closing speed for the present
+    normal (Mirtich 1996), so that a body that only translates arrives in one; a contact that touches and
+    separates may be passed for as long as its parabola stays open.
+    """
+    spinning = _unsteady(a, t1 - start) + _unsteady(b, t1 - start)
+
+    def safe_time(s):
+        contacts, v, acc = _motion(a, b, s)
+        approach = centre(a, s)[1] - centre(b, s)[1]
+        bound = jnp.maximum(-(contacts.normal * approach[None]).sum(1), 0.0) + spinning[None]
+        apart = jnp.where(bound > 0, safe_divide(contacts.gap, bound), jnp.inf)
+        return jnp.where(contacts.gap > near[None], apart, jnp.where(v < 0, 0.0, _time_to(contacts.gap, v, acc))).min(0)
+
+    def busy(carry):
+        count, s, dt = carry
+        return (count < ADVANCES) & jnp.any((dt > 0) & (s < t1))
+
+    def advance(carry):
+        count, s, dt = carry
+        onward = jnp.where(s < t1, jnp.minimum(s + jnp.maximum(dt, 0.0), t1), s)
+        return count + 1, onward, safe_time(onward)
+
+    return lax.while_loop(busy, advance, (0, start, safe_time(start)))[1]
+
+
+def _unsteady(side: Side, span: Array) -> Array:
+    """Bound on what spin and acceleration add to the speed of any point within the step, (*batch) [m/s]."""
+    f = side.flight
+    if f is None:
+        return jnp.zeros_like(span)
+    w = rotations(f.dim).unspin(f.inverse_inertia, f.q, f.L)
+    return 1.1 * norm(w) * reach_of(side) + norm(f.a) * jnp.maximum(span, 0.0)
+
+
+def _polish(a: Side, b: Side, s: Array, level: Array, size: Array) -> tuple[Array, Array]:
+    """Time near s at which the first contact comes to gap = level, and whether one does."""
+
+    def next_time(s):
+        contacts, v, acc = _motion(a, b, s)
+        return _time_to(contacts.gap - level[None], v, acc).min(0)
+
+    def towards(_, s):
+        dt = next_time(s)
+        return s + jnp.where(jnp.isfinite(dt), dt, 0.0)
+
+    s = lax.fori_loop(0, POLISH, towards, s)
+    contacts, v, acc = _motion(a, b, s)
+    slack = jnp.sqrt(jnp.finfo(s.dtype).eps) * size
+    at_level = (contacts.gap <= (level + slack)[None]) & ((v < 0) | (acc < 0))
+    return s, at_level.any(0)
+
+
+def _closest_level(a: Side, b: Side, s: Array, span: Array, width: Array) -> Array:
+    """Smooth level from the closest approach of the two paths, of the contact with the least gap at s.
+
+    The curvature of the gap is a difference of its rate over a quarter of the step: it holds what corners and
+    turning faces add. The approach is sought without gradient, then evaluated with it.
+    """
+    eta = 0.25 * span
+
+    def least(a, b, s):
+        contacts = contacts_of(a, place(a, s), b, place(b, s))
+        chosen = jax.nn.one_hot(jnp.argmin(contacts.gap, 0), contacts.gap.shape[0], axis=0, dtype=s.dtype)
+
+        def rate(t):
+            at_a, at_b = place(a, t), place(b, t)
+            return (chosen * gap_rates(contacts_of(a, at_a, b, at_b), at_a, at_b)).sum(0)
+
+        curvature = safe_divide(rate(s + eta) - rate(s - eta), 2.0 * eta)
+        return (chosen * contacts.gap).sum(0), rate(s), curvature
+
+    def towards(_, t):
+        _, v, curvature = least(*lax.stop_gradient((a, b)), t)
+        return jnp.clip(t - jnp.where(curvature > 0, safe_divide(v, curvature), 0.0), s - span, s + span)
+
+    closest = lax.stop_gradient(lax.fori_loop(0, POLISH, towards, s))
+    gap, v, curvature = least(a, b, closest)
+    turns_back = curvature > 0
+    gap_min = gap - 0.5 * safe_divide(v * v, jnp.where(turns_back, curvature, 0.0))
+    return jnp.where(turns_back, softplus(gap_min, width), 0.0)

@@ -1,0 +1,88 @@
+"""The impulse at one contact: effective mass, Newton's restitution and Coulomb friction.
+
+With K the matrix that turns an impulse P on body a (and -P on b) into a change of the relative velocity at
+the contact point,
+
+    n . v+ = target,  the normal law:    target = -e n . v-  (Newton)
+    P = gamma n + kappa Q,               gamma = (target - n . v-) / (n . K n),  1 / (n . K n): effective mass
+    K Q = -(slip after gamma n)          Q stops the slip and leaves the normal law as it is
+    |P_t| <= mu P_n                      kappa = 1 sticks; else the largest kappa in the cone slides
+    kinetic energy does not rise         a bound on kappa that acts rarely (Kane's paradox)
+
+For a round body this is the textbook law: |gamma_t| <= mu gamma, stick if the impulse that stops the slip
+fits. Where a corner couples the directions, Newton's law still holds exactly.
+Source: Chatterjee & Ruina, J. Applied Mechanics 65 (1998) 939, for the splitting; Kane & Levinson 1985.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid.contact.sides import Placed
+from diffrigid.numerics import dot, norm, safe_divide, safe_sqrt
+from diffrigid.so2 import perp
+from diffrigid.so3 import cross
+from diffrigid.state import rotations
+
+
+def effective_matrix(at_a: Placed, at_b: Placed, point: Array) -> Array:
+    """K at a world point, (D, D, *batch) [1/kg]: change of the relative velocity for a unit impulse."""
+    K: Any = 0.0
+    for at in (at_a, at_b):
+        if at.v is not None:
+            dim = at.x.shape[0]
+            unit = jnp.eye(dim, dtype=at.x.dtype).reshape(dim, dim, *[1] * (at.x.ndim - 1))
+            K = K + at.inverse_mass[None, None] * unit + rotations(dim).mobility(at.inverse_inertia, point - at.x)
+    return K
+
+
+def times(K: Array, P: Array) -> Array:
+    """K P, (D, D, *batch), (D, *batch) -> (D, *batch). K is symmetric."""
+    return sum((K[i] * P[i : i + 1] for i in range(1, K.shape[0])), K[0] * P[:1])
+
+
+def inverse_times(K: Array, r: Array) -> Array:
+    """K^-1 r by cofactors, 2 x 2 or 3 x 3; 0 where K is singular."""
+    if K.shape[0] == 2:
+        adjoint = -perp(times(K, perp(r)))
+        return safe_divide(adjoint, (K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0])[None])
+    bc, ca, ab = cross(K[1], K[2]), cross(K[2], K[0]), cross(K[0], K[1])
+    return safe_divide(jnp.stack([dot(bc, r), dot(ca, r), dot(ab, r)]), dot(K[0], bc)[None])
+
+
+def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
+    """Impulse of one contact, (D, *batch) [N s]; see the module's docstring. Zero if it separates anyway.
+
+    Args:
+        v: (D, *batch) [m/s] relative velocity before.
+        target: (*batch) [m/s] normal velocity after, >= 0.
+
+    Differentiable except at the switches: separating to closing, stick to slip.
+    """
+    Kn, v_n = times(K, n), dot(n, v)
+    gamma = jnp.maximum(safe_divide(target - v_n, dot(n, Kn)), 0.0)
+    after = v + gamma[None] * Kn
+    slip = after - dot(n, after)[None] * n
+    Q = -inverse_times(K, slip)
+    Q_n = dot(n, Q)
+    Q_t = norm(Q - Q_n[None] * n)
+    kappa = jnp.minimum(_within_cone(gamma, Q_n, Q_t, mu), _within_energy(gamma, Q_n, v_n, target, dot(Q, slip)))
+    return gamma[None] * n + kappa[None] * Q
+
+
+def _within_cone(gamma, Q_n, Q_t, mu):
+    """Largest kappa <= 1 with kappa Q_t <= mu (gamma + kappa Q_n)."""
+    excess = Q_t - mu * Q_n
+    outside = excess > mu * gamma
+    return jnp.where(outside, mu * gamma / jnp.where(outside, excess, 1.0), 1.0)
+
+
+def _within_energy(gamma, Q_n, v_n, target, Q_slip):
+    """Largest kappa <= 1 whose change of kinetic energy, T0 + b kappa + c kappa^2 / 2, is not positive."""
+    T0 = 0.5 * gamma * (v_n + target)
+    c = -Q_slip
+    b = Q_n * target - c
+    gains = T0 + b + 0.5 * c > 0
+    root = (safe_sqrt(b * b - 2.0 * c * jnp.minimum(T0, 0.0)) - b) / jnp.where(gains, c, 1.0)
+    return jnp.where(gains, jnp.clip(root, 0.0, 1.0), 1.0)

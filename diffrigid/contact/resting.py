@@ -1,0 +1,162 @@
+"""Many contacts at once: those that share a body at the same time, in an impact or at rest."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.contact.impulse import contact_law, times
+from diffrigid.contact.sides import at_colliders, side_sum
+from diffrigid.pytree import array, pytree, static
+from diffrigid.state import rotations
+
+ROUNDS = 128  # at most, of the iteration; one is exact for contacts that are alone on their bodies
+
+
+@pytree
+class Strikes:
+    """C contacts of all kinds in one list, each at its own time."""
+
+    active: Array = array("C")  # (C, *batch) bool: touching at s
+    s: Array = array("C")  # (C, *batch) [s]
+    gap: Array = array("C")  # [m]
+    normal: Array = array("C", "D")  # from b to a
+    arm_a: Array = array("C", "D")  # [m] contact point from the centre of mass of a, world axes
+    arm_b: Array = array("C", "D")
+    K: Array = array("C", "D", "D")  # [1/kg] effective matrix
+    v_rel: Array = array("C", "D")  # [m/s] of a against b at the contact point, before the impulse
+    push: Array = array("C")  # [m/s^2] closing acceleration along the normal
+    a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
+    b: tuple[int, ...] = static(default=())
+
+
+@pytree
+class Arms:
+    """Where C contacts act on their bodies; fields as in `Strikes`."""
+
+    arm_a: Array = array("C", "D")
+    arm_b: Array = array("C", "D")
+    a: tuple[int, ...] = static()
+    b: tuple[int, ...] = static()
+
+
+@pytree
+class Mobility:
+    """What turns impulses on the N moving bodies into changes of velocity."""
+
+    inverse_mass: Array = array("N")  # [1/kg]
+    inverse_inertia: Any = None  # [1/(kg m^2)] world axes
+
+
+def velocity_changes(arms: Strikes | Arms, P: Array, mobility: Mobility) -> tuple[Array, Array]:
+    """Changes of v (N, D) [m/s] and w (N, A) [rad/s] of the moving bodies by the impulses P on side a."""
+    so, moving = rotations(P.shape[1]), mobility.inverse_mass.shape[0]
+    turn_a, turn_b = jax.vmap(so.moment)(arms.arm_a, P), jax.vmap(so.moment)(arms.arm_b, -P)
+    linear = side_sum(P, -P, arms.a, arms.b, moving)
+    angular = side_sum(turn_a, turn_b, arms.a, arms.b, moving)
+    return mobility.inverse_mass[:, None] * linear, jax.vmap(so.apply)(mobility.inverse_inertia, angular)
+
+
+def relative_changes(arms: Strikes | Arms, dv: Array, dw: Array) -> Array:
+    """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
+    cross = jax.vmap(rotations(dv.shape[1]).cross)
+    at_a = at_colliders(dv, arms.a, 0.0) + cross(at_colliders(dw, arms.a, 0.0), arms.arm_a)
+    at_b = at_colliders(dv, arms.b, 0.0) + cross(at_colliders(dw, arms.b, 0.0), arms.arm_b)
+    return at_a - at_b
+
+
+def solve_impulses(strikes: Strikes, target: Array, mu: Array, mobility: Mobility) -> Array:
+    """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
+
+    Each contact solves its own law against a share of the mass of its bodies (mass splitting; Tonge et al.
+    2012), all at once, until nothing changes: one round where contacts are alone on their bodies. Momentum is
+    kept whatever the number of rounds. The derivative is that of the fixed point (implicit function theorem),
+    so it costs no memory and does not depend on how the iteration got there.
+
+    Args:
+        target: (C, *batch) [m/s] normal velocity after the impulse.
+        mu: (C, *batch) [-].
+    """
+    one = strikes.active.astype(strikes.s.dtype)
+    crowd = side_sum(one, one, strikes.a, strikes.b, mobility.inverse_mass.shape[0])
+    split = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
+    split = lax.stop_gradient(jnp.maximum(split, 1.0))
+    arms = Arms(arm_a=strikes.arm_a, arm_b=strikes.arm_b, a=strikes.a, b=strikes.b)
+    law = Law(K=strikes.K * split[:, None, None], normal=strikes.normal, target=target, mu=mu, on=one)
+    return _fixed_point(jnp.any((split > 1) & strikes.active), law, strikes.v_rel, arms, mobility)
+
+
+@pytree
+class Law:
+    """Arguments of the contact law at every contact, but for the velocity."""
+
+    K: Array = array("C", "D", "D")
+    normal: Array = array("C", "D")
+    target: Array = array("C")
+    mu: Array = array("C")
+    on: Array = array("C")  # 1 where active, else 0
+
+
+def _apply_law(law: Law, v: Array) -> Array:
+    solved = jax.vmap(contact_law)(law.K, law.normal, v, law.target, law.mu)
+    return jnp.where(law.on[:, None] > 0, solved, 0.0)
+
+
+def _others(law: Law, P: Array, arms: Arms, mobility: Mobility) -> Array:
+    """Change of the relative velocity at every contact by the impulses at all others, (C, D, *batch) [m/s]."""
+    return relative_changes(arms, *velocity_changes(arms, P, mobility)) - jax.vmap(times)(law.K, P)
+
+
+@jax.custom_jvp
+def _fixed_point(shared: Array, law: Law, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
+    """P = law(v_rel + what the others do), iterated until nothing changes if any body is shared."""
+
+    def one_round(P):
+        return _apply_law(law, v_rel + _others(law, P, arms, mobility))
+
+    return _repeat(one_round, _apply_law(law, v_rel), shared)
+
+
+@_fixed_point.defjvp
+def _fixed_point_jvp(primals, tangents):
+    """dP = A dP + (law moved at fixed P), with A = (d law / dv) (what others do), solved by the same iteration."""
+    shared, law, v_rel, arms, mobility = primals
+    _, dlaw, dv_rel, darms, dmobility = tangents
+    P = _fixed_point(*primals)
+
+    def others(law, arms, mobility):
+        return _others(law, P, arms, mobility)
+
+    change, dchange = jax.jvp(others, (law, arms, mobility), (dlaw, darms, dmobility))
+    v = v_rel + change
+    moved = jax.jvp(_apply_law, (law, v), (dlaw, dv_rel + dchange))[1]
+    units = jnp.eye(v.shape[1], dtype=v.dtype).reshape(v.shape[1], 1, v.shape[1], *[1] * (v.ndim - 2))
+    units = units + jnp.zeros_like(v)[None]
+    columns = jax.vmap(lambda unit: jax.jvp(lambda v: _apply_law(law, v), (v,), (unit,))[1])(units)
+    columns = lax.stop_gradient(columns)
+
+    def linear(x):
+        y = _others(law, x, arms, mobility)
+        return x - sum(columns[i] * y[:, i : i + 1] for i in range(y.shape[1]))
+
+    def solve(matvec, b):
+        return _repeat(lambda x: x + b - matvec(x), b, shared)
+
+    return P, lax.custom_linear_solve(linear, moved, solve, transpose_solve=solve)
+
+
+def _repeat(one_round, first: Array, shared: Array) -> Array:
+    """Repeat from the result of the first round until the change is rounding; not at all if no body is shared."""
+
+    def busy(carry):
+        # The change is measured here, on stored arrays: beside the round, XLA would compute the law again for it.
+        count, x, before = carry
+        change, size = jnp.max(jnp.abs(x - before)), jnp.max(jnp.abs(x))
+        return shared & (count < ROUNDS) & (change > 4.0 * jnp.finfo(x.dtype).eps * size)
+
+    def again(carry):
+        count, x, _ = carry
+        return count + 1, one_round(x), x
+
+    return lax.while_loop(busy, again, (0, first, jnp.zeros_like(first)))[1]

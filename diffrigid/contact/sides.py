@@ -1,0 +1,153 @@
+"""The two colliders of a pair on their paths, and sums over the pairs that each body is in."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from diffrigid.collide import COLLIDERS, Contacts, PairGroup
+from diffrigid.collide.distance import reach
+from diffrigid.flight import Flight, angular_velocity, orientation, position, velocity
+from diffrigid.numerics import dot, norm
+from diffrigid.pytree import array, pytree
+from diffrigid.shapes import HalfSpace
+from diffrigid.state import rotations
+
+
+@pytree
+class Side:
+    """One collider of a pair: its path, its shape in the shape's own axes, and where that sits on the body."""
+
+    flight: Any  # Flight, None: it does not move, and x, q hold its pose
+    since: Any = array(default=None)  # [s] earliest time for which the path holds
+    shape: Any
+    offset: Any = array("D", default=None)  # [m] shape origin from the centre of mass, body axes
+    x: Any = array("D", default=None)
+    q: Any = array("Q", default=None)
+
+
+@pytree
+class Placed:
+    """A collider at one time. For one that does not move, velocities and inverse inertias are None."""
+
+    x: Array = array("D")  # [m]
+    q: Array = array("Q")
+    v: Any = array("D", default=None)  # [m/s]
+    w: Any = array("A", default=None)  # [rad/s]
+    a: Any = array("D", default=None)  # [m/s^2]
+    inverse_mass: Any = array(default=None)  # [1/kg]
+    inverse_inertia: Any = None  # [1/(kg m^2)] world axes
+
+
+def sides_of(world: Any, pairs: PairGroup, flight: Flight, since: Array) -> tuple[Side, Side]:
+    """Both sides of P pairs of one kind, every array with a leading axis P."""
+    moving = flight.t0.shape[0]
+
+    def rows(tree, index):
+        return jax.tree.map(lambda leaf: leaf[np.array(index)], tree)
+
+    def side(colliders, group, shape_rows):
+        shape, offset = rows((world.shapes[group], world.offsets[group]), shape_rows)
+        offset = None if offset is None else offset.r
+        if min(colliders) < moving:
+            return Side(flight=rows(flight, colliders), since=rows(since, colliders), shape=shape, offset=offset)
+        x, q = rows((world.statics.x, world.statics.q), np.array(colliders) - moving)
+        return Side(flight=None, shape=shape, offset=offset, x=x, q=q)
+
+    return side(pairs.a, pairs.shape_a, pairs.row_a), side(pairs.b, pairs.shape_b, pairs.row_b)
+
+
+def place(side: Side, s: Array) -> Placed:
+    """The collider at time s (*batch) [s]."""
+    f = side.flight
+    if f is None:
+        return Placed(x=side.x, q=side.q)
+    q = orientation(f, s)
+    w, inverse = angular_velocity(f, q, s), rotations(f.dim).world_inverse(f.inverse_inertia, q)
+    x, v = position(f, s), velocity(f, s)
+    return Placed(x=x, q=q, v=v, w=w, a=f.a, inverse_mass=f.inverse_mass, inverse_inertia=inverse)
+
+
+def centre(side: Side, s: Array) -> tuple[Array, Array]:
+    """Centre of mass [m] and its velocity [m/s] at time s."""
+    if side.flight is None:
+        return side.x, jnp.zeros_like(side.x)
+    return position(side.flight, s), velocity(side.flight, s)
+
+
+def contacts_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
+    """Contacts of the pair where its colliders are placed."""
+    return COLLIDERS[type(a.shape), type(b.shape)](a.shape, *_origin(a, at_a), b.shape, *_origin(b, at_b))
+
+
+def _origin(side: Side, at: Placed) -> tuple[Array, Array]:
+    if side.offset is None:
+        return at.x, at.q
+    return at.x + rotations(at.x.shape[0]).rotate(at.q, side.offset), at.q
+
+
+def relative_velocity(at_a: Placed, at_b: Placed, point: Array) -> Array:
+    """Velocity of a against b at a world point, (D, *batch) [m/s]."""
+    return _difference(lambda at: at.v + rotations(at.x.shape[0]).cross(at.w, point - at.x), at_a, at_b)
+
+
+def relative_acceleration(at_a: Placed, at_b: Placed, point: Array) -> Array:
+    """Acceleration of a against b at a world point, a + w x (w x r) of each, without angular acceleration."""
+
+    def one(at):
+        so = rotations(at.x.shape[0])
+        return at.a + so.cross(at.w, so.cross(at.w, point - at.x))
+
+    return _difference(one, at_a, at_b)
+
+
+def _difference(of, at_a: Placed, at_b: Placed) -> Array:
+    if at_b.v is None:
+        return of(at_a)
+    return -of(at_b) if at_a.v is None else of(at_a) - of(at_b)
+
+
+def gap_rates(contacts: Contacts, at_a: Placed, at_b: Placed) -> Array:
+    """d(gap)/ds of every contact, (K, *batch) [m/s]: the normal velocity of a against b at the contact point."""
+    return jax.vmap(lambda n, p: dot(n, relative_velocity(at_a, at_b, p)))(contacts.normal, contacts.point)
+
+
+def reach_of(side: Side) -> Array:
+    """Radius about the centre of mass that holds the shape, (*batch) [m]; huge for a half-space."""
+    if isinstance(side.shape, HalfSpace):
+        return jnp.full_like(side.shape.offset, 1e6)
+    shape, offset = lax.stop_gradient((side.shape, side.offset))
+    dim = side.x.shape[0] if side.flight is None else side.flight.dim
+    return reach(shape, dim) if offset is None else reach(shape, dim) + norm(offset)
+
+
+def side_sum(values_a: Array, values_b: Array, a: tuple[int, ...], b: tuple[int, ...], moving: int) -> Array:
+    """Sum of per-contact values over the contacts of each moving body, (N, ...).
+
+    By gathering each body's contacts, padded to the most any body has: forward it is one fused loop, where a
+    scatter is a serial one.
+    """
+    values_a, values_b = lax.optimization_barrier((values_a, values_b))
+    rows = jnp.concatenate([values_a, values_b, jnp.zeros_like(values_a[:1])])
+    return rows[body_sides(a, b, moving)].sum(1)
+
+
+def body_sides(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> np.ndarray:
+    """For each moving body, the rows of [contacts as a, contacts as b, nothing] that touch it, (N, most)."""
+    sides: list[list[int]] = [[] for _ in range(moving)]
+    for row, body in enumerate(a + b):
+        if body < moving:
+            sides[body].append(row)
+    most = max(map(len, sides), default=0)
+    return np.array([rows + [2 * len(a)] * (most - len(rows)) for rows in sides], dtype=np.int32)
+
+
+def at_colliders(values: Array, colliders: tuple[int, ...], fill: float) -> Array:
+    """Values of the moving bodies (N, ...) at each contact's collider, (C, ...); `fill` for statics."""
+    index = np.array(colliders)
+    still = index.max() + 1 - values.shape[0]
+    if still > 0:
+        values = jnp.concatenate([values, jnp.full((still, *values.shape[1:]), fill, values.dtype)])
+    return values[index]

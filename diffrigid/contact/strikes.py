@@ -1,0 +1,113 @@
+"""The contacts of all pairs of a world as one list, whatever their kinds."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from diffrigid.contact.impact import find_impact
+from diffrigid.contact.impulse import effective_matrix
+from diffrigid.contact.resting import Strikes
+from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
+from diffrigid.flight import Flight
+from diffrigid.forces import is_uniform
+from diffrigid.numerics import dot, norm
+from diffrigid.pytree import replace
+from diffrigid.shapes import HalfSpace
+from diffrigid.state import rotations
+
+
+def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array) -> Strikes:
+    """The contacts of every pair at its next impact or, where `at_end` (a bool), at the end of the step.
+
+    Active are those that touch then; of the next impact, only if it happens before the end.
+    """
+    straight, contact = is_uniform(world.forces), world.contact
+
+    def one(a: Side, b: Side) -> Strikes:
+        s, hit, level, slack = find_impact(a, b, dt, contact.width, straight, contact.rest_speed, at_end)
+        at_a, at_b = place(a, s), place(b, s)
+        contacts = contacts_of(a, at_a, b, at_b)
+        active = (contacts.gap <= (level + slack)[None]) & hit[None]
+        pulled = -_acceleration(at_a, at_b)
+
+        def each(normal, point, gap):
+            return Strikes(
+                active=gap < 0, s=s, gap=gap, normal=normal, arm_a=point - at_a.x, arm_b=point - at_b.x,
+                K=effective_matrix(at_a, at_b, point), v_rel=relative_velocity(at_a, at_b, point),
+                push=dot(normal, pulled),
+            )  # fmt: skip
+
+        return replace(jax.vmap(each)(contacts.normal, contacts.point, contacts.gap), active=active)
+
+    parts = []
+    for pairs in world.pairs:
+        part = jax.vmap(one)(*sides_of(world, pairs, flight, since))
+        parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
+    if len(parts) > 1:
+        # The barrier keeps XLA from fusing all that made the parts into the copy, a loop with a branch in it.
+        parts = lax.optimization_barrier(parts)
+        strikes = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
+    else:
+        strikes = parts[0]
+    return replace(strikes, **ends(world))
+
+
+def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
+    """False (a bool) if no two bounding spheres of any pair in any world of the batch can touch within the step.
+
+    The test costs a fraction of looking for impacts, and spares a step without them everything else.
+    """
+    margin = 40.0 * world.contact.width  # beyond it a smooth impulse is below rounding, exp(-40)
+
+    def one(a: Side, b: Side) -> Array:
+        a, b = lax.stop_gradient((a, b))
+        start = jnp.zeros_like(dt)
+        (x_a, v_a), (x_b, v_b) = centre(a, start), centre(b, start)
+        if isinstance(b.shape, HalfSpace):
+            n = rotations(x_a.shape[0]).rotate(b.q, b.shape.normal)
+            apart, closing = dot(n, x_a - x_b) - b.shape.offset - reach_of(a), jnp.abs(dot(n, v_a - v_b))
+        else:
+            apart, closing = norm(x_a - x_b) - reach_of(a) - reach_of(b), norm(v_a - v_b)
+        pull = sum(norm(side.flight.a) for side in (a, b) if side.flight is not None)
+        return jnp.any(apart <= dt * (closing + 0.5 * dt * pull) + margin)
+
+    since = jnp.zeros_like(flight.t0)
+    near = [jnp.any(jax.vmap(one)(*sides_of(world, pairs, flight, since))) for pairs in world.pairs]
+    return jnp.any(jnp.stack(near))
+
+
+def ends(world: Any) -> dict[str, tuple[int, ...]]:
+    """Colliders a and b of every contact of the list."""
+
+    def column(of):
+        return tuple(int(i) for pairs in world.pairs for i in np.repeat(of(pairs), pairs.count))
+
+    return {"a": column(lambda pairs: pairs.a), "b": column(lambda pairs: pairs.b)}
+
+
+def _acceleration(at_a, at_b) -> Array:
+    if at_b.v is None:
+        return at_a.a
+    return -at_b.a if at_a.v is None else at_a.a - at_b.a
+
+
+def materials(world: Any) -> tuple[Array, Array]:
+    """Restitution and friction of every contact of the list, (C, *batch).
+
+    The mean over the two bodies; a value that a body was given outweighs one that it has by default.
+    """
+    index = ends(world)
+    a, b = np.array(index["a"]), np.array(index["b"])
+
+    def combine(name, given):
+        moving, still = getattr(world.bodies, name), getattr(world.statics, name)
+        batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
+        values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
+        given = np.array(given, values.dtype)
+        share = (0.5 * (1.0 + given[a] - given[b])).reshape(-1, *[1] * len(batch))
+        return share * values[a] + (1.0 - share) * values[b]
+
+    return combine("restitution", world.own_restitution), combine("friction", world.own_friction)

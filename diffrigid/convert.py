@@ -1,0 +1,218 @@
+"""What users write, as arrays of one type: NumPy where the values are known, and then checked, else traced.
+
+Every function takes the name of the argument first, for its messages. Known values stay NumPy, because under
+`jit` even a constant is traced as soon as JAX holds it.
+"""
+
+import difflib
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid import so2
+from diffrigid.pytree import map_arrays, replace
+from diffrigid.shapes import dimension, traced, volume_properties, with_topology
+
+TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: what is typed has a few digits
+FLAT = 1e-9  # [-] of the largest principal inertia: what is smaller has no thickness
+
+Numbers = Any  # np.ndarray where known, Array where traced
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """Text that lists the names most like one that does not exist."""
+    near = difflib.get_close_matches(str(name), sorted(names), n=3, cutoff=0.4)
+    return f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(sorted(names))}."
+
+
+def known(fn: Callable, *args: Any) -> Any:
+    """fn(*args) in NumPy if all arguments are known, whatever is being traced around."""
+    if traced(args):
+        return fn(*args)
+    with jax.ensure_compile_time_eval():
+        return jax.tree.map(np.asarray, fn(*args))
+
+
+def stack(rows: Sequence, shape: tuple[int, ...] = ()) -> Numbers:
+    """Rows along a new first axis; `shape` is that of one, needed where there are none."""
+    if not rows:
+        return np.zeros((0, *shape), jnp.result_type(float))
+    return jnp.stack(rows) if traced(rows) else np.stack(rows)
+
+
+def numbers(where: str, value: Any, shape: tuple[int, ...] | None) -> Numbers:
+    """`value` as floats, of this shape unless None, and finite."""
+    expected = "numbers" if shape is None else "a number" if shape == () else f"numbers of shape {shape}"
+    try:
+        array = _array(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where} is {value!r}: expected {expected}.") from error
+    if shape is not None and array.shape != shape:
+        raise ValueError(f"{where} has shape {array.shape}: expected {expected}, without batch axes.")
+    if not traced(array) and not np.isfinite(array).all():
+        raise ValueError(f"{where} is {array}: expected finite numbers; look for a NaN where it was made.")
+    return array
+
+
+def _array(value: Any) -> Numbers:
+    dtype = jnp.result_type(float)
+    if not traced(value):
+        array = np.asarray(value)
+        if array.dtype.kind not in "iuf":
+            raise TypeError(f"not numbers: {array.dtype}")
+        return array.astype(dtype)
+    if isinstance(value, tuple | list):
+        return jnp.stack([jnp.asarray(_array(part)) for part in value])
+    return jnp.asarray(value, dtype)
+
+
+def positive(where: str, value: Any, fix: str) -> Numbers:
+    """A number above zero."""
+    array = numbers(where, value, ())
+    if not traced(array) and not array > 0:
+        raise ValueError(f"{where} is {float(array):g}: expected above 0; {fix}.")
+    return array
+
+
+def fraction(where: str, value: Any) -> Numbers:
+    """A coefficient of restitution."""
+    array = numbers(where, value, ())
+    if not traced(array) and not 0 <= array <= 1:
+        raise ValueError(f"{where} is {float(array):g}: expected 0 (no rebound) to 1 (no loss); clip it.")
+    return array
+
+
+def coefficient(where: str, value: Any) -> Numbers:
+    """A coefficient of friction."""
+    array = numbers(where, value, ())
+    if not traced(array) and not array >= 0:
+        raise ValueError(f"{where} is {float(array):g}: expected 0 or above; give it without sign.")
+    return array
+
+
+def orientation(name: str, body: Any, dim: int) -> Numbers:
+    """q of a body or static from its q or angle, (2,) or (4,), of length one."""
+    if body.angle is not None:
+        if body.q is not None:
+            raise ValueError(f"{name}: got both angle and q; give one of them.")
+        if dim == 3:
+            raise ValueError(f"{name}.angle: expected q = (w, x, y, z), a unit quaternion, in a 3D scene.")
+        return known(so2.exp, numbers(f"{name}.angle", body.angle, ())[None])
+    unturned = (1.0, 0.0) if dim == 2 else (1.0, 0.0, 0.0, 0.0)
+    q = numbers(f"{name}.q", unturned if body.q is None else body.q, (len(unturned),))
+    length = (jnp if traced(q) else np).sqrt((q * q).sum())
+    if not traced(q) and abs(length - 1) > TYPED:
+        raise ValueError(f"{name}.q has length {length:.6g}: expected 1; divide it by its length.")
+    return q / length
+
+
+def angular_velocity(name: str, w: Any, dim: int) -> Numbers:
+    """w, (1,) or (3,); in 2D a number will do."""
+    size = 1 if dim == 2 else 3
+    array = numbers(f"{name}.w", np.zeros(size) if w is None else w, None)
+    return numbers(f"{name}.w", array[None] if dim == 2 and array.ndim == 0 else array, (size,))
+
+
+# ---- shapes, mass, inertia
+
+
+class Solid(NamedTuple):
+    """A shape and its properties; see `volume_properties`."""
+
+    shape: Any
+    volume: Numbers
+    center: Numbers
+    gyration: Numbers
+
+
+def shape_of(name: str, shape: Any, dim: int) -> Any:
+    """A shape with float leaves and the topology of a hull filled in."""
+    if dimension(shape) not in (None, dim):
+        kind = type(shape).__name__
+        raise ValueError(f"{name}.shape is a {kind} of {dimension(shape)}D: use a shape of {dim}D, as the scene.")
+    return map_arrays(lambda leaf, letters, _: _array(leaf), with_topology(shape))
+
+
+def solid_of(shape: Any, dim: int) -> Solid | None:
+    """A shape with its properties; None for None."""
+    return None if shape is None else Solid(shape, *known(lambda s: volume_properties(s, dim), shape))
+
+
+def mass_and_inertia(name: str, body: Any, solid: Solid | None, dim: int) -> tuple[Numbers, Numbers]:
+    """Mass () [kg] and inertia () or (3, 3) [kg m^2] from what a body was given.
+
+    With the mass given, the inertia is mass * gyration: that is finite for a rod without volume.
+    """
+    if (body.mass is None) == (body.density is None):
+        came = "neither" if body.mass is None else "both"
+        raise ValueError(f"{name}: expected either mass [kg] or density, got {came}; give one of them.")
+    if solid is None and (body.mass is None or body.inertia is None):
+        raise ValueError(f"{name}.shape is None: expected both mass and inertia; give them, or a shape.")
+    if body.mass is not None:
+        mass = positive(f"{name}.mass", body.mass, "use Static for what does not move")
+    else:
+        density = positive(f"{name}.density", body.density, "use Static for what does not move")
+        mass = density * solid.volume  # type: ignore[union-attr]
+        if not traced(solid.volume) and not solid.volume > 0:  # type: ignore[union-attr]
+            raise ValueError(f"{name}.shape has no volume, and so no mass: give mass instead of density.")
+    if body.inertia is not None:
+        return mass, _inertia(f"{name}.inertia", body.inertia, dim)
+    gyration = solid.gyration  # type: ignore[union-attr]
+    if not traced(gyration) and dim == 3:
+        low, _, high = np.linalg.eigvalsh(gyration)
+        if low <= FLAT * high:
+            raise ValueError(f"{name}.shape has no thickness, and so no inertia about its line: give inertia.")
+    return mass, mass * gyration
+
+
+def _inertia(where: str, value: Any, dim: int) -> Numbers:
+    """An inertia about the centre of mass, () or (3, 3), from a number, or principal values or a matrix."""
+    if dim == 2:
+        return positive(where, value, "a point has none; give that of a small disc, m r^2 / 2")
+    array = numbers(where, value, None)
+    if array.shape in ((), (3,)):
+        array = array.reshape(-1, 1) * np.eye(3, dtype=array.dtype)
+    if array.shape != (3, 3):
+        raise ValueError(
+            f"{where} has shape {array.shape}: expected a number, three principal values, or a (3, 3) matrix."
+        )
+    if traced(array):
+        return array
+    low, middle, high = np.linalg.eigvalsh(array)
+    text = f"{where} has principal values {low:.4g}, {middle:.4g}, {high:.4g}"
+    if not np.allclose(array, array.T, rtol=TYPED, atol=TYPED * abs(high)):
+        raise ValueError(f"{where} is not symmetric: expected I = I^T; average it with its transpose.")
+    if low <= 0:
+        raise ValueError(f"{text}: expected all above 0; check signs, products of inertia enter negative.")
+    if high > (low + middle) * (1 + TYPED):
+        raise ValueError(
+            f"{text}: expected none larger than the sum of the others (triangle inequality), "
+            "as for any distribution of mass; check the order and the units."
+        )
+    return array
+
+
+def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
+    """A force with indices for the names of bodies, and arrays with the axes of their fields for numbers."""
+    if isinstance(force, type) or not callable(force) or not hasattr(force, "__dataclass_fields__"):
+        raise ValueError(f"forces: {name!r} is {force!r}: expected a record such as Drag(linear=0.1).")
+    changes: dict[str, Any] = {}
+    for field in ("body", "a", "b"):
+        target = getattr(force, field, None)
+        if target is not None and target not in bodies:
+            raise ValueError(f"{name}.{field} is {target!r}, which is not a moving body: {nearest(target, bodies)}")
+        if target is not None:
+            changes[field] = bodies.index(target)
+    sizes = {"N": len(bodies), "D": dim, "A": 1 if dim == 2 else 3, "Q": 2 if dim == 2 else 4}
+
+    def fill(leaf, letters, path):
+        axes = tuple(sizes.get(letter) for letter in letters)
+        array = numbers(path, leaf, None)
+        if array.ndim == 0 and None not in axes:  # a number stands for all components
+            array = (jnp if traced(array) else np).broadcast_to(array, axes)
+        return numbers(path, array, None if None in axes else axes)
+
+    return map_arrays(fill, replace(force, **changes), name)

@@ -1,0 +1,148 @@
+"""Forces: each a record with its coefficients as float leaves, and a call that returns a `Wrench`.
+
+A force is called as `force(bodies, state, controls)`. To add one, write such a record; three class
+attributes let the step skip work, and all default to the general case when absent:
+
+    constant   the wrench does not change within a step, so the flight of the step is exact
+    uniform    every body has the same constant acceleration, so that relative paths are straight
+    twists     the wrench has a torque
+"""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid.numerics import dot, normalise, safe_sqrt
+from diffrigid.pytree import Leaf, array, pytree, static
+from diffrigid.state import Bodies, State, Wrench, material_point, material_velocity, rotations
+
+
+@pytree
+class Gravity:
+    """F = m g."""
+
+    g: Leaf = array("D")  # (D, *batch) [m/s^2]
+    constant: ClassVar[bool] = True
+    uniform: ClassVar[bool] = True
+    twists: ClassVar[bool] = False
+
+    def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:
+        del state, controls
+        return Wrench(F=bodies.mass[:, None] * self.g[None])
+
+
+@pytree
+class Drag:
+    """F = -linear * v and tau = -angular * w, on every body: viscous drag, world axes."""
+
+    linear: Leaf = array("D", default=0.0)  # (D, *batch) [N s/m]; a number stands for all directions
+    angular: Leaf = array(default=0.0)  # (*batch) [N m s/rad]
+    constant: ClassVar[bool] = False
+    uniform: ClassVar[bool] = False
+    twists: ClassVar[bool] = True
+
+    def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:
+        del bodies, controls
+        return Wrench(F=-self.linear[None] * state.v, tau=-self.angular[None, None] * state.w)
+
+
+@pytree
+class Force:
+    """A force at a point fixed to a body; with `control`, plus what `controls[control]` holds, (D, *batch) [N]."""
+
+    body: str = static()
+    F: Leaf = array("D")  # (D, *batch) [N] world axes
+    point: Leaf = array("D", default=None)  # (D, *batch) [m] body axes; None: the centre of mass
+    control: str | None = static(default=None)
+    constant: ClassVar[bool] = False  # the arm turns with the body
+    uniform: ClassVar[bool] = False
+    twists: ClassVar[bool] = True
+
+    def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:
+        so, i = rotations(bodies.dim), self.body
+        F = self.F if self.control is None else self.F + controls[self.control]
+        F_all, tau_all = jnp.zeros_like(state.v), jnp.zeros_like(state.w)
+        if self.point is not None:
+            tau_all = tau_all.at[i].add(so.moment(so.rotate(state.q[i], self.point), F))
+        return Wrench(F=F_all.at[i].add(F), tau=tau_all)
+
+
+@pytree
+class Torque:
+    """A torque on a body; with `control`, plus what `controls[control]` holds, (A, *batch) [N m]."""
+
+    body: str = static()
+    tau: Leaf = array("A")  # (A, *batch) [N m] world axes
+    control: str | None = static(default=None)
+    constant: ClassVar[bool] = True  # controls are held over a step
+    uniform: ClassVar[bool] = False
+    twists: ClassVar[bool] = True
+
+    def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:
+        del bodies
+        tau = self.tau if self.control is None else self.tau + controls[self.control]
+        return Wrench(F=jnp.zeros_like(state.v), tau=jnp.zeros_like(state.w).at[self.body].add(tau))
+
+
+@pytree
+class SpringDamper:
+    """Spring and damper along the line between two points: F = -stiffness (l - length) - damping dl/dt.
+
+    Anchors are in body axes, from the centre of mass; `b=None` ties to the world, and `anchor_b` is a world
+    point. Where the two points coincide the direction, and so the force, is taken as zero.
+    """
+
+    a: str = static()
+    b: str | None = static(default=None)
+    anchor_a: Leaf = array("D")  # (D, *batch) [m]
+    anchor_b: Leaf = array("D")  # (D, *batch) [m]
+    stiffness: Leaf = array()  # (*batch) [N/m]
+    damping: Leaf = array(default=0.0)  # (*batch) [N s/m]
+    length: Leaf = array(default=0.0)  # (*batch) [m] at rest
+    constant: ClassVar[bool] = False
+    uniform: ClassVar[bool] = False
+    twists: ClassVar[bool] = True
+
+    def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:
+        del controls
+        so = rotations(bodies.dim)
+        point_a, v_a = self._end(state, self.a, self.anchor_a)
+        point_b, v_b = self._end(state, self.b, self.anchor_b)
+        span = point_a - point_b
+        along = normalise(span)
+        stretch = safe_sqrt(dot(span, span)) - self.length
+        F = -(self.stiffness * stretch + self.damping * dot(along, v_a - v_b))[None] * along
+        F_all, tau_all = jnp.zeros_like(state.v), jnp.zeros_like(state.w)
+        for body, point, sign in ((self.a, point_a, 1.0), (self.b, point_b, -1.0)):
+            if body is not None:
+                F_all = F_all.at[body].add(sign * F)
+                tau_all = tau_all.at[body].add(so.moment(point - state.x[body], sign * F))
+        return Wrench(F=F_all, tau=tau_all)
+
+    @staticmethod
+    def _end(state: State, body: Any, anchor: Array) -> tuple[Array, Array]:
+        if body is None:
+            return anchor + jnp.zeros_like(state.x[0]), jnp.zeros_like(state.v[0])
+        return material_point(state, body, anchor), material_velocity(state, body, anchor)
+
+
+def is_constant(forces: tuple) -> bool:
+    """True if no wrench changes within a step."""
+    return all(getattr(force, "constant", False) for force in forces)
+
+
+def is_uniform(forces: tuple) -> bool:
+    """True if all bodies fall alike."""
+    return all(getattr(force, "uniform", False) for force in forces)
+
+
+def total_wrench(forces: tuple, bodies: Bodies, state: State, controls: Any) -> Wrench:
+    """Sum of all forces; the torque is None when no force has one."""
+    F, tau = jnp.zeros_like(state.v), None
+    for force in forces:
+        wrench = force(bodies, state, controls)
+        F = F + wrench.F
+        if wrench.tau is not None and getattr(force, "twists", True):
+            tau = wrench.tau if tau is None else tau + wrench.tau
+    return Wrench(F=F, tau=tau)

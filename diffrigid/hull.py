@@ -1,0 +1,158 @@
+"""Faces and edges of convex hulls, from concrete corners, in NumPy. V vertices, F faces, T triangles."""
+
+import itertools
+
+import numpy as np
+
+FLAT = 1e-5  # relative to the size of a shape, or rad: what is flatter is flat; above the rounding of float32
+
+
+def hull_faces(vertices) -> tuple:
+    """Triangles (i, j, k) of the surface of a convex hull, counter-clockwise seen from outside.
+
+    Args:
+        vertices: (V, 3) concrete numbers, each a corner of the hull; V up to about 64: the cost grows as V^4.
+
+    A flat face with more than three corners becomes a fan from one of them.
+    """
+    corners = _corners(vertices)
+    if problem := hull_problem(corners):
+        raise ValueError(f"this hull {problem}")
+    return tuple((f[0], *pair) for f in _flat_faces(corners) for pair in itertools.pairwise(f[1:]))
+
+
+def hull_edges(faces: tuple, vertices=None) -> tuple:
+    """The distinct edges (i, j), i < j, of a closed surface of triangles, sorted.
+
+    With concrete `vertices` (V, 3), without those between two triangles in one plane.
+    """
+    apex = apexes(faces)
+    pairs = sorted(pair for pair in apex if pair[0] < pair[1])
+    if vertices is None:
+        return tuple(pairs)
+    corners = _corners(vertices)
+    size = extent(corners)
+    return tuple((i, j) for i, j in pairs if _bend(corners, i, j, apex[i, j], apex[j, i]) > FLAT * size)
+
+
+def apexes(faces: tuple) -> dict:
+    """The third corner of the triangle to the left of each directed side (i, j)."""
+    return {side: k for i, j, k in faces for side, k in (((i, j), k), ((j, k), i), ((k, i), j))}
+
+
+def _corners(vertices):
+    """Concrete vertices of one hull, (V, 3) in double precision."""
+    corners = np.asarray(vertices, float)
+    if corners.ndim != 2 or corners.shape[1] != 3:
+        raise ValueError(f"hull vertices have shape {corners.shape}: expected (V, 3), one hull without batch.")
+    return corners
+
+
+def _bend(corners, i, j, k, l):
+    """How far two triangles (i, j, k), (j, i, l) are from one plane [m].
+
+    Measured at the apex nearer to the edge, from the plane of the other triangle: that does not magnify the
+    rounding of a thin one.
+    """
+    left, right = (np.cross(corners[j] - corners[i], corners[m] - corners[i]) for m in (k, l))
+    volume = abs(left @ (corners[l] - corners[i]))
+    return volume / max(np.linalg.norm(left), np.linalg.norm(right))
+
+
+def _flat_faces(corners):
+    """Flat faces of the hull of (V, 3) corners: lists of indices, counter-clockwise seen from outside.
+
+    Brute force: a plane through three corners holds a face if no corner is above it.
+    """
+    triples, normals, heights = _planes(corners)
+    margin = FLAT * extent(corners)
+    found = []
+    for n in np.flatnonzero((heights <= margin).all(1)):
+        # larger triangles come first, so the plane of a face is not taken from three corners almost in line
+        if not any(set(triples[n]) <= set(face) for face in found):
+            on = np.flatnonzero(heights[n] >= -margin)
+            found.append(_around(corners, on, normals[n]))
+    return found
+
+
+def _planes(corners):
+    """Planes through three corners, in both senses, by falling area of the triangle.
+
+    Returns:
+        indices (T, 3), unit normals (T, 3), and heights of all corners over each plane (T, V) [m].
+    """
+    triples = np.array(list(itertools.combinations(range(len(corners)), 3)))
+    a, b, c = corners[triples].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    area = np.linalg.norm(normals, axis=1)
+    longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)], axis=0)
+    order = np.argsort(-area, kind="stable")
+    order = order[area[order] > FLAT * extent(corners) * longest[order]]  # three in line define no plane
+    normals = normals[order] / area[order, None]
+    heights = normals @ corners.T - (normals * a[order]).sum(1, keepdims=True)
+    return np.repeat(triples[order], 2, axis=0), *(_both_senses(rows) for rows in (normals, heights))
+
+
+def _both_senses(rows):
+    """Each row followed by its negative: (T, n) -> (2 T, n)."""
+    return np.stack([rows, -rows], axis=1).reshape(-1, rows.shape[1])
+
+
+def _around(corners, on, normal):
+    """The indices `on` of corners in one plane, in counter-clockwise order about its unit normal."""
+    r = corners[on] - corners[on].mean(0)
+    u = r[0] / np.linalg.norm(r[0])
+    angle = np.arctan2(r @ np.cross(normal, u), r @ u)
+    return [int(i) for i in on[np.argsort(angle)]]
+
+
+# ---- what can be wrong
+
+
+def hull_problem(value):
+    value = value.astype(float)
+    apart = np.linalg.norm(value[:, None] - value[None], axis=2)
+    if len(twins := np.argwhere(np.triu(apart <= FLAT * extent(value), k=1))):
+        return f"repeats a point, {twins[0][0]} and {twins[0][1]}: leave one out."
+    if np.linalg.svd(value - value.mean(0), compute_uv=False)[-1] <= FLAT * extent(value):
+        return "lies in one plane: move a point out of it, or use a Box with a zero half extent for a plate."
+    faces = _flat_faces(value)
+    # a corner is where three faces meet; a point in an edge has two, in a face one, inside none
+    count = np.bincount(list(itertools.chain(*faces)), minlength=len(value))
+    if (n := first(count < 3)) is not None:
+        return f"has point {n} that is no corner of the convex hull: leave it out."
+    if len(value) - sum(map(len, faces)) // 2 + len(faces) != 2:  # Euler
+        return f"is flat to {FLAT:g} of its size at some edges: leave out the points that stick out least."
+
+
+def faces_problem(value, faces):
+    if any(len(set(face)) != 3 or not set(face) <= set(range(len(value))) for face in faces):
+        return f"must be triples of different indices from 0 to {len(value) - 1}."
+    sides = sorted(pair for i, j, k in faces for pair in ((i, j), (j, k), (k, i)))
+    if len(set(sides)) < len(sides) or sides != sorted((j, i) for i, j in sides):
+        return "do not close the surface in one sense: leave them out, and they are found."
+    volume, expected = _volume(value, faces), _volume(value, hull_faces(value))
+    if abs(volume + expected) <= FLAT * expected:
+        return "are inside out: reverse each triple, (k, j, i)."
+    if abs(volume - expected) > FLAT * expected:
+        return f"enclose {volume:.6g} m^3 of {expected:.6g} in the hull: leave them out, and they are found."
+
+
+def _volume(corners, faces):
+    """Signed volume [m^3] inside a closed surface of triangles."""
+    return np.linalg.det(corners[np.array(faces)] - corners.mean(0)).sum() / 6
+
+
+def first(wrong):
+    """Index of the first true entry, None if there is none."""
+    return int(np.argmax(wrong)) if wrong.any() else None
+
+
+def extent(corners):
+    """Longest side [m] of the box around corners (V, D)."""
+    return np.ptp(corners, axis=0).max()
+
+
+def triples(faces):
+    """`faces` as a tuple of triples of int."""
+    return tuple(tuple(int(i) for i in face) for face in faces)

@@ -1,0 +1,101 @@
+"""Which bodies overlap: the exact signed distance of two rounded convex shapes, in NumPy, for known scenes.
+
+The distance of two convex cores is the largest separation along any direction, and the largest is found along
+one of finitely many: normals of faces, perpendiculars of two edges or of an edge and a vertex, lines through
+two vertices (separating axes). For cores that overlap it is minus the least translation that parts them.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from diffrigid.convert import known
+from diffrigid.shapes import HalfSpace, edges, radius, vertices
+
+
+class Placed(NamedTuple):
+    """A collider in the world; V corners, E edges."""
+
+    corners: np.ndarray  # (V, D) [m]; of a half space (1, D), a point of its surface
+    sides: np.ndarray  # (E, D) [m] its edges, as vectors
+    starts: np.ndarray  # (E, D) [m] and where they start
+    rounding: float  # [m]
+    normal: np.ndarray | None  # (D,) of a half space
+
+    @property
+    def size(self) -> float:
+        """Radius about the mean corner that holds it [m]."""
+        if self.normal is not None:
+            return np.inf
+        return np.linalg.norm(self.corners - self.corners.mean(0), axis=1).max() + self.rounding
+
+
+def place(shape: Any, x: np.ndarray, q: np.ndarray, center: np.ndarray) -> Placed:
+    """A shape of which the point `center` is at x (D,) [m], with orientation q."""
+    dim = len(x)
+    x = x - _rotate(q, np.asarray(center)[None])[0]
+    if isinstance(shape, HalfSpace):
+        normal = _rotate(q, np.asarray(shape.normal)[None])[0]
+        none = np.zeros((0, dim))
+        return Placed((x + shape.offset * normal)[None], none, none, 0.0, normal)
+    corners = x + _rotate(q, known(lambda s: vertices(s, dim), shape))
+    if dim == 3:
+        pairs = edges(shape, dim)
+    else:
+        pairs = tuple((i, (i + 1) % len(corners)) for i in range(len(corners)) if len(corners) > 1)
+    ends = np.array(pairs, int).reshape(-1, 2)
+    starts = corners[ends[:, 0]]
+    return Placed(corners, corners[ends[:, 1]] - starts, starts, float(known(radius, shape)), None)
+
+
+def _rotate(q, rows):
+    """Rows (V, D) from body to world axes."""
+    if len(q) == 2:
+        return rows @ np.array([[q[0], q[1]], [-q[1], q[0]]])
+    s, u = q[0], q[1:]
+    t = 2.0 * np.cross(u, rows)
+    return rows + s * t + np.cross(u, t)
+
+
+def separation(a: Placed, b: Placed) -> float:
+    """Signed distance [m], negative in penetration. One of the two may be a half space."""
+    for solid, other in ((a, b), (b, a)):
+        if solid.normal is not None:
+            return ((other.corners - solid.corners) @ solid.normal).min() - other.rounding
+    directions = _directions(a, b)
+    length = np.linalg.norm(directions, axis=1)
+    scale = max(a.size, b.size)
+    n = directions[length > 1e-12 * scale] / length[length > 1e-12 * scale, None]
+    n = np.concatenate([n, -n])
+    apart = (a.corners @ n.T).min(0) - (b.corners @ n.T).max(0)
+    return apart.max(initial=-scale) - a.rounding - b.rounding
+
+
+def _directions(a: Placed, b: Placed) -> np.ndarray:
+    """Candidates for the direction of the closest approach, of any length, (M, D)."""
+    dim = a.corners.shape[1]
+    between = (a.corners[:, None] - b.corners[None]).reshape(-1, dim)
+    sides = np.concatenate([a.sides, b.sides])
+    if dim == 2:
+        return np.concatenate([between, sides[:, ::-1] * [1.0, -1.0]])
+    i, j = np.triu_indices(len(sides), 1)  # of one body: normals of its faces
+    return np.concatenate([between, np.cross(sides[i], sides[j]), _across(a, b), _across(b, a)])
+
+
+def _across(a: Placed, b: Placed) -> np.ndarray:
+    """From each edge of b to each corner of a, at right angles to the edge."""
+    to = a.corners[:, None] - b.starts[None]
+    share = (to * b.sides).sum(2) / (b.sides**2).sum(1)
+    return (to - share[:, :, None] * b.sides).reshape(-1, 3)
+
+
+def overlapping(colliders: dict[int, Placed], pairs: list, margin: float) -> list[tuple[int, int]]:
+    """Those pairs (i, j) of keys of `colliders` that penetrate by more than `margin` of the smaller size."""
+    size = {key: collider.size for key, collider in colliders.items()}
+    centre = {key: collider.corners.mean(0) for key, collider in colliders.items()}
+    deep = []
+    for i, j in pairs:
+        if i in size and j in size and np.linalg.norm(centre[i] - centre[j]) < size[i] + size[j]:
+            if separation(colliders[i], colliders[j]) < -margin * min(size[i], size[j]):
+                deep.append((i, j))
+    return deep

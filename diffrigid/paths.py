@@ -1,0 +1,148 @@
+"""Names of parameters: a path such as "ball.mass" and the leaf, or the part of one, that it stands for.
+
+restitution, friction, gravity           all bodies and statics; the gravity vector
+contact.width, contact.rest_speed        numbers of the contact model
+FORCE.field                              a force of the scene, by its name: "drag.linear"
+BODY.mass | inertia | restitution | friction | shape.FIELD
+BODY.x | v | q | w | angle               initial state (angle: 2D)
+STATIC.x | q | angle | restitution | friction | shape.FIELD
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid import so2
+from diffrigid.convert import nearest
+from diffrigid.forces import Gravity
+from diffrigid.pytree import array_fields, replace
+from diffrigid.state import State
+from diffrigid.world import World
+
+UNITS = {
+    "mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2", "g": "m/s^2",
+    "x": "m", "v": "m/s", "angle": "rad", "w": "rad/s",
+    "radius": "m", "half": "m", "half_length": "m", "vertices": "m", "offset": "m", "width": "m",
+    "linear": "N s/m", "angular": "N m s", "stiffness": "N/m", "damping": "N s/m", "length": "m",
+    "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
+}  # fmt: skip
+
+
+class Place(NamedTuple):
+    """A leaf and the row of it that a path names. Chain: attribute names and tuple indices from (world, state)."""
+
+    chain: tuple[str | int, ...]
+    row: int | None  # None: all of it
+    angle: bool = False  # the leaf is q, the value an angle
+
+
+def read(world: World, state: State, path: str) -> Array:
+    """Value of a parameter, without batch axes: shape () or (D,) or as its leaf has it."""
+    place = places(world, path)[0]
+    leaf: Any = (world, state)
+    for key in place.chain:
+        leaf = leaf[key] if isinstance(key, int) else getattr(leaf, key)
+    value: Any = leaf if place.row is None else leaf[place.row]
+    if path in ("restitution", "friction"):
+        return value[0]
+    return so2.log(value)[0] if place.angle else value
+
+
+def write(world: World, state: State, path: str, value: Any) -> tuple[World, State]:
+    """World and state with a parameter changed; everything else shared. Works on traced values.
+
+    Raises:
+        ValueError: there is no such parameter, or the value has another shape. "restitution" and "friction"
+            take a number for all.
+    """
+    pair: Any = (world, state)
+    for place in places(world, path):
+        pair = _update(pair, place.chain, lambda record, field, place=place: _set(record, field, place, path, value))
+    return pair
+
+
+def unit(path: str) -> str:
+    """SI unit of a parameter, by its last name; "" where it has none or is unknown."""
+    return UNITS.get(path.split(".")[-1], "")
+
+
+def places(world: World, path: str) -> list[Place]:
+    """The leaves that a path names.
+
+    Raises:
+        ValueError: there is no such parameter; the message lists the nearest.
+    """
+    catalogue = _catalogue(world)
+    if path not in catalogue:
+        raise ValueError(f"no parameter {path!r} in this world: {nearest(path, catalogue)}")
+    return catalogue[path]
+
+
+def _catalogue(world: World) -> dict[str, list[Place]]:
+    """Every path of a world."""
+    out: dict[str, list[Place]] = {}
+    for name in ("restitution", "friction"):
+        out[name] = [Place((0, "bodies", name), None)]
+        if world.static_names:
+            out[name].append(Place((0, "statics", name), None))
+    for index, (name, force) in enumerate(zip(world.force_names, world.forces, strict=True)):
+        for field in array_fields(force):
+            if getattr(force, field) is not None:
+                out[f"{name}.{field}"] = [Place((0, "forces", index, field), None)]
+        if isinstance(force, Gravity):
+            out["gravity"] = [Place((0, "forces", index, "g"), None)]
+    out |= {f"contact.{field}": [Place((0, "contact", field), None)] for field in array_fields(world.contact)}
+    for row, name in enumerate(world.names):
+        out |= {f"{name}.{f}": [Place((0, "bodies", f), row)] for f in ("mass", "inertia", "restitution", "friction")}
+        out |= {f"{name}.{f}": [Place((1, f), row)] for f in ("x", "q", "v", "w")}
+        if world.dim == 2:
+            out[f"{name}.angle"] = [Place((1, "q"), row, angle=True)]
+    for row, name in enumerate(world.static_names):
+        out |= {f"{name}.{f}": [Place((0, "statics", f), row)] for f in ("x", "q", "restitution", "friction")}
+        if world.dim == 2:
+            out[f"{name}.angle"] = [Place((0, "statics", "q"), row, angle=True)]
+    names = world.names + world.static_names
+    for group, (shape, owners) in enumerate(zip(world.shapes, world.owners, strict=True)):
+        for row, owner in enumerate(owners):
+            for field in array_fields(shape):
+                out[f"{names[owner]}.shape.{field}"] = [Place((0, "shapes", group, field), row)]
+    return out
+
+
+def _update(node: Any, chain: tuple, change) -> Any:
+    key, rest = chain[0], chain[1:]
+    if isinstance(key, int):
+        return (*node[:key], _update(node[key], rest, change), *node[key + 1 :])
+    return replace(node, **{key: _update(getattr(node, key), rest, change) if rest else change(node, key)})
+
+
+def _set(record: Any, field: str, place: Place, path: str, value: Any) -> Array:
+    """The leaf `record.field` with the value put into its place."""
+    leaf = getattr(record, field)
+    try:
+        value = jnp.asarray(value, leaf.dtype)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} is {value!r}: expected numbers.") from error
+    expected, batch = _axes(record, field, place)
+    if place.row is None and path in ("restitution", "friction") and value.ndim == 0:
+        return jnp.broadcast_to(value, leaf.shape)
+    if value.ndim == 0 and expected == (1,):
+        value = value[None]
+    if value.shape not in (expected, expected + batch):
+        raise ValueError(f"{path} was given the shape {value.shape}: expected {expected}, as `read` returns it.")
+    value = so2.exp(value[None]) if place.angle else value
+    value = value.reshape(value.shape + (1,) * (leaf.ndim - (place.row is not None) - value.ndim))
+    if place.row is None:
+        return jnp.broadcast_to(value, leaf.shape)
+    return leaf.at[place.row].set(jnp.broadcast_to(value, leaf.shape[1:]))
+
+
+def _axes(record: Any, field: str, place: Place) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Shape of the value of a place in one world, and the batch axes that its leaf has behind it."""
+    letters = next(f.metadata["letters"] for f in dataclasses.fields(record) if f.name == field)
+    letters = letters[0](record) if letters and callable(letters[0]) else letters
+    rank = len(letters) - (letters[:1] in (("N",), ("S",)) and place.row is not None)
+    shape = getattr(record, field).shape[place.row is not None :]
+    return () if place.angle else shape[:rank], shape[rank:]

@@ -1,0 +1,91 @@
+"""Records: frozen, keyword-only dataclasses that JAX sees as pytrees.
+
+A field is declared by what it holds:
+
+    x: Array = array("N", "D")        # a float leaf, with the letters of its axes for ONE world
+    names: tuple = static()           # compiled in: hashable, never differentiated
+    bodies: Bodies                    # another record, or a tuple or dict of records
+
+The letters serve twice. `world.check` compares them with what came, so that a wrong shape is reported by
+name; and because they fix the rank of a leaf without a batch, any further trailing axes are known to be batch
+axes (`batch_rank`, `align`). Records hold data; behaviour is functions.
+"""
+
+import dataclasses
+from typing import Any, dataclass_transform
+
+import jax
+
+replace = dataclasses.replace
+
+Leaf = Any  # a field that a user fills with a number or a tuple, and `scene` with an array
+
+
+def array(*letters: Any, default: Any = dataclasses.MISSING) -> Any:
+    """Field for a float array whose axes, for one world, are named by `letters` (none: a number)."""
+    return dataclasses.field(default=default, metadata={"letters": letters}, kw_only=True)
+
+
+def static(default: Any = dataclasses.MISSING) -> Any:
+    """Field for compiled-in data: integers, strings, tuples of them. Must hash and compare."""
+    return dataclasses.field(default=default, metadata={"static": True}, kw_only=True)
+
+
+def stacked(letter: str) -> Any:
+    """Field for records of which every array has one more leading axis, named by `letter`."""
+    return dataclasses.field(metadata={"stacked": (letter,)}, kw_only=True)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(array, static, stacked))
+def pytree(cls):
+    """Make `cls` a frozen, keyword-only dataclass and register it with JAX."""
+    cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    fields = dataclasses.fields(cls)
+    meta = [f.name for f in fields if f.metadata.get("static")]
+    data = [f.name for f in fields if f.name not in meta]
+    return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=meta)
+
+
+def map_arrays(fn, node, where: str = "", stack: tuple[str, ...] = ()):
+    """Apply `fn(leaf, letters, path)` to every declared array of a record, tuple or dict of records."""
+    if node is None:
+        return None
+    if isinstance(node, tuple):
+        return tuple(map_arrays(fn, child, f"{where}[{i}]", stack) for i, child in enumerate(node))
+    if isinstance(node, dict):
+        return {key: map_arrays(fn, child, f"{where}[{key!r}]", stack) for key, child in node.items()}
+    changed = {}
+    for field in dataclasses.fields(node):
+        if field.metadata.get("static"):
+            continue
+        value, path = getattr(node, field.name), f"{where}.{field.name}"
+        letters = field.metadata.get("letters")
+        if letters is None:
+            changed[field.name] = map_arrays(fn, value, path, stack + field.metadata.get("stacked", ()))
+        elif value is not None:
+            # Axes may depend on the dimension, a static field of the record.
+            letters = letters[0](node) if letters and callable(letters[0]) else letters
+            changed[field.name] = fn(value, stack + letters, path)
+    return replace(node, **changed)
+
+
+def batch_rank(node) -> int:
+    """Number of trailing batch axes: the largest surplus of a leaf over its declared letters."""
+    surplus = [0]
+    map_arrays(lambda leaf, letters, _: surplus.append(jax.numpy.ndim(leaf) - len(letters)), node)
+    return max(surplus)
+
+
+def align(node, rank: int):
+    """Give every array `rank` trailing batch axes, of length one where it has none, so that all broadcast."""
+
+    def expand(leaf, letters, _):
+        missing = len(letters) + rank - jax.numpy.ndim(leaf)
+        return leaf.reshape(leaf.shape + (1,) * missing) if missing else leaf
+
+    return map_arrays(expand, node)
+
+
+def array_fields(record) -> list[str]:
+    """Names of the float leaves of a record."""
+    return [field.name for field in dataclasses.fields(record) if "letters" in field.metadata]

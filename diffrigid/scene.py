@@ -1,0 +1,291 @@
+"""`scene`: from bodies as a user writes them to `(World, State)`. All checks of values are made here."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid.collide import COLLIDERS, pair_groups
+from diffrigid.contact import Contact
+from diffrigid.convert import (
+    Solid,
+    angular_velocity,
+    coefficient,
+    force_of,
+    fraction,
+    mass_and_inertia,
+    nearest,
+    numbers,
+    orientation,
+    shape_of,
+    solid_of,
+    stack,
+)
+from diffrigid.forces import Gravity
+from diffrigid.overlap import overlapping, place
+from diffrigid.pytree import map_arrays
+from diffrigid.shape_checks import check_shape
+from diffrigid.shapes import HalfSpace, Hull, Polygon, Shape, dimension, traced
+from diffrigid.state import Bodies, State
+from diffrigid.world import Offset, Statics, World
+
+OVERLAP = 1e-4  # [-] of the smaller size: penetration at the start that is worth a warning
+RESERVED = ("restitution", "friction", "contact")  # paths, or the first part of one; and "gravity"
+
+
+@dataclass(frozen=True)
+class Body:
+    """A moving body, at its start.
+
+    Args:
+        shape: a shape, or None for a body without geometry, which needs `mass` and `inertia`.
+        mass: [kg]; or density: [kg/m^2] in 2D, [kg/m^3] in 3D. One of the two.
+        inertia: [kg m^2] about the centre of mass, body axes: a number in 2D; three principal values or a
+            (3, 3) matrix in 3D. Default: that of the shape, uniform.
+        x: [m] centre of mass. v: [m/s]. w: [rad/s], world frame, a number in 2D.
+        angle: [rad] (2D), or q: (cos, sin) in 2D, unit quaternion (w, x, y, z) in 3D. Default: unturned.
+        restitution, friction: default: those of the scene.
+    """
+
+    shape: Shape | None
+    mass: Any = None
+    density: Any = None
+    inertia: Any = None
+    x: Any = None
+    v: Any = None
+    angle: Any = None
+    q: Any = None
+    w: Any = None
+    restitution: Any = None
+    friction: Any = None
+
+
+@dataclass(frozen=True)
+class Static:
+    """A shape that does not move, its origin at x [m], turned by angle [rad] (2D) or q."""
+
+    shape: Shape
+    x: Any = None
+    angle: Any = None
+    q: Any = None
+    restitution: Any = None
+    friction: Any = None
+
+
+def scene(
+    bodies: Mapping[str, Body | Static],
+    *,
+    gravity: Any = None,
+    restitution: Any = 0.0,
+    friction: Any = 0.0,
+    contact: Contact | None = None,
+    forces: Sequence | Mapping = (),
+    ignore: Sequence[tuple[str, str]] = (),
+) -> tuple[World, State]:
+    """World and initial state from named bodies.
+
+    Args:
+        gravity: (D,) [m/s^2]; None: none.
+        restitution, friction: [-] of every body and static that does not set its own. A contact takes the
+            mean of its two sides, or the one that was set if only one was.
+        contact: the contact model; default `Contact()`, exact impacts.
+        forces: records from `diffrigid.forces`, in a sequence or by name; a name is what a path to it starts
+            with, by default the class in lower case. They name bodies as `bodies` does.
+        ignore: pairs of names that pass through each other.
+
+    Raises:
+        ValueError: names the argument, what was expected, and the fix. Traced values are not checked.
+
+    Warns:
+        UserWarning: bodies that overlap at the start.
+    """
+    moving, still = _sorted(bodies)
+    everything: dict[str, Body | Static] = {**moving, **still}
+    dim, n = _dimension(moving, gravity), len(moving)
+    passing = _passing(ignore, list(everything))
+    shapes = {k: None if b.shape is None else shape_of(k, b.shape, dim) for k, b in everything.items()}
+    solids = {name: solid_of(shapes[name], dim) for name in moving}
+    records, offsets, owners = _stack_shapes(shapes, solids, dim)
+    kinds = [type(record) for record in records]
+    pairs = pair_groups(kinds, owners, n, passing, COLLIDERS, lambda i, j: _count(records[i], records[j], dim))
+    e, own_e = _material("restitution", everything, restitution)
+    mu, own_mu = _material("friction", everything, friction)
+    mass, inertia = zip(*(mass_and_inertia(k, b, solids[k], dim) for k, b in moving.items()), strict=True)
+    named_forces = _forces(forces, gravity, moving, still, dim)
+    made = World(
+        bodies=Bodies(mass=stack(mass), inertia=stack(inertia), restitution=e[:n], friction=mu[:n], dim=dim),
+        statics=Statics(**_poses(still, dim), restitution=e[n:], friction=mu[n:]),
+        shapes=records, offsets=offsets, owners=owners, pairs=pairs,
+        forces=tuple(named_forces.values()), force_names=tuple(named_forces),
+        contact=_contact(Contact() if contact is None else contact),
+        names=tuple(moving), static_names=tuple(still), own_restitution=own_e, own_friction=own_mu,
+    )  # fmt: skip
+    start = _state(moving, dim)
+    _warn_of_overlap(made, start, shapes, solids)
+    return jax.tree.map(jnp.asarray, (made, start))
+
+
+# ---- names and dimension
+
+
+def _sorted(bodies: Mapping[str, Body | Static]) -> tuple[dict[str, Body], dict[str, Static]]:
+    """Moving bodies and statics, each in the order given."""
+    if not isinstance(bodies, Mapping):
+        raise ValueError(f"bodies is {bodies!r}: expected a dict of names, {{'ball': Body(...)}}.")
+    for name, body in bodies.items():
+        if not isinstance(body, Body | Static):
+            raise ValueError(f"bodies[{name!r}] is {body!r}: expected a Body or a Static around the shape.")
+        if not isinstance(name, str) or not name or "." in name or name in (*RESERVED, "gravity"):
+            raise ValueError(f"bodies: {name!r} is no name: expected a string, no path, no dots; rename it.")
+        if isinstance(body, Static) and body.shape is None:
+            raise ValueError(f"{name}.shape is None: expected a shape; leave out a Static without one.")
+        if isinstance(body, Body) and isinstance(body.shape, HalfSpace):
+            raise ValueError(f"{name}.shape is a HalfSpace, which has no mass: make {name} a Static.")
+        if isinstance(body, Body) and body.x is None:
+            raise ValueError(f"{name}.x is missing: expected the centre of mass, (2,) or (3,) [m]; give x.")
+        if body.shape is not None:
+            check_shape(body.shape, f"{name}.shape")
+    moving = {name: body for name, body in bodies.items() if isinstance(body, Body)}
+    if not moving:
+        raise ValueError(f"bodies has no Body, only {list(bodies)}: expected one that moves; add a Body.")
+    return moving, {name: body for name, body in bodies.items() if isinstance(body, Static)}
+
+
+def _passing(ignore: Any, names: list[str]) -> set[frozenset[int]]:
+    """The pairs of `ignore` as sets of two colliders."""
+    for pair in ignore:
+        if isinstance(pair, str) or len(pair) != 2:
+            raise ValueError(f"ignore has {pair!r}: expected pairs of names, [('arm', 'hand')]; add a bracket.")
+        for name in pair:
+            if name not in names:
+                raise ValueError(f"ignore names {name!r}, which is not a body: {nearest(name, names)}")
+    return {frozenset(names.index(name) for name in pair) for pair in ignore}
+
+
+def _dimension(moving: Mapping[str, Body], gravity: Any) -> int:
+    """2 or 3: the number of components of gravity and every position, and the dimension of every shape."""
+    sizes = {} if gravity is None else {"gravity": _length("gravity", gravity)}
+    for name, body in moving.items():
+        sizes[f"{name}.x"] = _length(f"{name}.x", body.x)
+        if body.shape is not None and (size := dimension(body.shape)):
+            sizes[f"{name}.shape"] = size
+    if len(set(sizes.values())) > 1:
+        raise ValueError(f"a scene is all 2D or all 3D, but got {sizes}: use the same number of components.")
+    return next(iter(sizes.values()))
+
+
+def _length(where: str, value: Any) -> int:
+    array = numbers(where, value, None)
+    if array.shape not in ((2,), (3,)):
+        raise ValueError(f"{where} has shape {array.shape}: expected 2 or 3 numbers, one for each axis.")
+    return len(array)
+
+
+# ---- the parts of a world
+
+
+def _poses(bodies: Mapping[str, Body | Static], dim: int) -> dict[str, Any]:
+    """Positions and orientations, stacked."""
+    x = [numbers(f"{k}.x", np.zeros(dim) if b.x is None else b.x, (dim,)) for k, b in bodies.items()]
+    q = [orientation(k, b, dim) for k, b in bodies.items()]
+    return {"x": stack(x, (dim,)), "q": stack(q, (2 if dim == 2 else 4,))}
+
+
+def _state(moving: Mapping[str, Body], dim: int) -> State:
+    v = [numbers(f"{k}.v", np.zeros(dim) if b.v is None else b.v, (dim,)) for k, b in moving.items()]
+    w = [angular_velocity(k, b.w, dim) for k, b in moving.items()]
+    return State(**_poses(moving, dim), v=stack(v), w=stack(w))
+
+
+def _material(field: str, everything: Mapping, default: Any) -> tuple[Any, tuple[bool, ...]]:
+    """Values of all colliders, (N + S,), and whether each was given to it."""
+    check = fraction if field == "restitution" else coefficient
+    general = check(field, default)
+    own = {name: getattr(body, field) for name, body in everything.items()}
+    values = [general if value is None else check(f"{name}.{field}", value) for name, value in own.items()]
+    return stack(values), tuple(value is not None for value in own.values())
+
+
+def _stack_shapes(shapes: Mapping[str, Any], solids: Mapping[str, Solid | None], dim: int):
+    """Shapes of one kind (type and static fields) in one record each, their offsets, and their owners.
+
+    A moving shape sits with its centre of mass, a static one with its origin, on the collider.
+    """
+    groups: dict[Any, list[tuple[int, Any, Any]]] = {}
+    for index, (name, shape) in enumerate(shapes.items()):
+        if shape is not None:
+            key = (jax.tree.structure(shape), tuple(leaf.shape for leaf in jax.tree.leaves(shape)))
+            solid = solids.get(name)
+            origin = np.zeros(dim, jnp.result_type(float)) if solid is None else -solid.center
+            groups.setdefault(key, []).append((index, shape, origin))
+    records, offsets, owners = [], [], []
+    for rows in groups.values():
+        owner, same, offset = zip(*rows, strict=True)
+        records.append(jax.tree.map(lambda *leaves: stack(leaves), *same))
+        owners.append(owner)
+        offsets.append(Offset(r=stack(offset)) if isinstance(same[0], Polygon | Hull) else None)
+    return tuple(records), tuple(offsets), tuple(owners)
+
+
+def _count(shape_a: Any, shape_b: Any, dim: int) -> int:
+    """Contacts that the pair function returns for these two kinds of shapes."""
+    x, q = np.zeros(dim, jnp.result_type(float)), np.zeros(2 if dim == 2 else 4, jnp.result_type(float))
+    a, b = (jax.tree.map(lambda leaf: leaf[0], shape) for shape in (shape_a, shape_b))
+    contacts = jax.eval_shape(COLLIDERS[type(a), type(b)], a, x, q, b, x, q)
+    return contacts.gap.shape[0]
+
+
+def _forces(forces: Any, gravity: Any, moving: Mapping, still: Mapping, dim: int) -> dict[str, Any]:
+    """All forces by name."""
+    named: dict[str, Any] = {} if gravity is None else {"gravity": Gravity(g=numbers("gravity", gravity, (dim,)))}
+    if not isinstance(forces, Mapping):
+        if isinstance(forces, str) or not isinstance(forces, Sequence):
+            raise ValueError(f"forces is {forces!r}: expected a sequence or a dict of forces; add brackets.")
+        kinds = [type(force).__name__.lower() for force in forces]
+        later = [kinds[:i].count(kind) for i, kind in enumerate(kinds)]
+        forces = {k + (str(i) if i else ""): f for k, i, f in zip(kinds, later, forces, strict=True)}
+    for name, force in forces.items():
+        taken = name in (*named, *moving, *still, *RESERVED)
+        if taken or not isinstance(name, str) or not name or "." in name:
+            raise ValueError(
+                f"forces: {name!r} is no name, or is taken: expected a string without dots that no body or "
+                "other force has; choose another."
+            )
+        named[name] = force_of(name, force, list(moving), dim)
+    return named
+
+
+def _contact(contact: Any) -> Contact:
+    if not isinstance(contact, Contact):
+        raise ValueError(f"contact is {contact!r}: expected a Contact(width=0.0).")
+    if not isinstance(contact.sweeps, int) or contact.sweeps < 1:
+        raise ValueError(f"contact.sweeps is {contact.sweeps!r}: expected an integer above 0; leave it out.")
+
+    def check(leaf, letters, path):
+        del letters
+        array = numbers(path, leaf, ())
+        if not traced(array) and array < 0:
+            raise ValueError(f"{path} is {float(array):g}: expected 0 or above; 0 turns it off.")
+        return array
+
+    return map_arrays(check, contact, "contact")
+
+
+def _warn_of_overlap(world: World, state: State, shapes: Mapping, solids: Mapping) -> None:
+    """Warn of pairs that penetrate at the start; those with a value that is traced are left out."""
+    poses = [*zip(state.x, state.q, strict=True), *zip(world.statics.x, world.statics.q, strict=True)]
+    placed = {}
+    for index, ((name, shape), (x, q)) in enumerate(zip(shapes.items(), poses, strict=True)):
+        solid = solids.get(name)
+        center = np.zeros(world.dim) if solid is None else solid.center
+        if shape is not None and not traced((shape, center, x, q)):
+            placed[index] = place(shape, x, q, center)
+    pairs = [pair for group in world.pairs for pair in zip(group.a, group.b, strict=True)]
+    if deep := overlapping(placed, pairs, OVERLAP):
+        names = list(shapes)
+        text = ", ".join(f"{names[i]} and {names[j]}" for i, j in sorted(deep))
+        warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore.", stacklevel=3)

@@ -1,0 +1,292 @@
+"""Shapes of bodies: dimensions, corners and edges, mass, centre of mass, inertia.
+
+All coordinates are in the shape's own axes [m]. Every shape but the half space is a core, the convex hull of
+`vertices(shape, dim)`, rounded by `radius(shape)`; contacts see only these two.
+
+Letters: D space (2 or 3), V vertices, F faces. The float leaves are differentiable, the
+topology of a hull (`faces`, `edges`) is static.
+"""
+
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from diffrigid.hull import apexes, hull_edges, hull_faces, triples
+from diffrigid.pytree import Leaf, array, pytree, replace, static
+
+_BALL = (1.0, 2.0, math.pi, 4 * math.pi / 3)  # volume of the unit ball by dimension
+_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+_CUBE = tuple((*corner, z) for z in (-1, 1) for corner in _SQUARE)
+_CUBE_EDGES = tuple(  # corners that differ in one sign
+    (i, j) for i, j in itertools.combinations(range(8), 2) if np.dot(_CUBE[i], _CUBE[j]) == 1
+)
+_BESIDE = {*_CUBE_EDGES, *((j, i) for i, j in _CUBE_EDGES)}
+
+
+@pytree
+class Disc:
+    """Disc in 2D, centred on the origin."""
+
+    radius: Leaf = array()  # (*batch) [m] > 0
+
+
+@pytree
+class Sphere:
+    """Ball in 3D, centred on the origin."""
+
+    radius: Leaf = array()  # (*batch) [m] > 0
+
+
+@pytree
+class Box:
+    """Rectangle (2D) or cuboid (3D) along the axes, centred on the origin; a zero extent makes it thin."""
+
+    half: Leaf = array("D")  # (D, *batch) [m] >= 0, half of each side
+
+
+@pytree
+class Capsule:
+    """Segment from (-half_length, 0[, 0]) to (half_length, 0[, 0]), rounded by `radius`. In 2D a stadium."""
+
+    radius: Leaf = array()  # (*batch) [m] >= 0; 0 is a thin rod
+    half_length: Leaf = array()  # (*batch) [m] > 0, without the round ends
+
+
+@pytree
+class Polygon:
+    """Strictly convex polygon in 2D, its vertices counter-clockwise."""
+
+    vertices: Leaf = array("V", "D")  # (V, 2, *batch) [m], V >= 3
+
+
+@pytree
+class Hull:
+    """Convex polyhedron in 3D, each of its vertices a corner. `with_topology` fills in faces and edges."""
+
+    vertices: Leaf = array("V", "D")  # (V, 3, *batch) [m], V >= 4
+    faces: tuple | None = static(None)  # triples of vertices, counter-clockwise seen from outside; see hull_faces
+    edges: tuple | None = static(None)  # pairs of vertices; see hull_edges
+
+
+@pytree
+class HalfSpace:
+    """The solid {r : normal . r <= offset}, 2D or 3D. For bodies that do not move."""
+
+    normal: Leaf = array("D")  # (D, *batch) unit vector out of the solid
+    offset: Leaf = array(default=0.0)  # (*batch) [m]
+
+
+SHAPES = (Disc, Sphere, Box, Capsule, Polygon, Hull, HalfSpace)
+Shape = Disc | Sphere | Box | Capsule | Polygon | Hull | HalfSpace
+
+
+def dimension(shape: Shape) -> int | None:
+    """Dimension of the space a shape lives in, 2 or 3; None for a capsule, which lives in either."""
+    match shape:
+        case Disc() | Polygon():
+            return 2
+        case Sphere() | Hull():
+            return 3
+        case Box():
+            return len(shape.half)
+        case HalfSpace():
+            return len(shape.normal)
+    return None
+
+
+# ---- the core and its rounding
+
+
+def vertices(shape: Shape, dim: int) -> Array:
+    """Corners of the core, (V, D, *batch) [m]: the shape is their convex hull, rounded by `radius(shape)`.
+
+    A disc or sphere has one, a capsule two, a box 4 (counter-clockwise) or 8. Linear in every leaf.
+    """
+    match shape:
+        case Disc() | Sphere():
+            size = floats(shape.radius)
+            return jnp.zeros((1, dim, *size.shape), size.dtype)
+        case Capsule():
+            x = jnp.stack([-floats(shape.half_length), floats(shape.half_length)])
+            return jnp.stack([x] + [jnp.zeros_like(x)] * (dim - 1), axis=1)
+        case Box():
+            half = floats(shape.half)
+            signs = jnp.asarray(_SQUARE if dim == 2 else _CUBE, half.dtype)
+            return signs.reshape(signs.shape + (1,) * (half.ndim - 1)) * half[None]
+        case Polygon() | Hull():
+            return floats(shape.vertices)
+    raise ValueError(f"{type(shape).__name__} has no vertices; it needs its own colliders.")
+
+
+def radius(shape: Shape) -> Array:
+    """Rounding radius, (*batch) [m]: the distance from the core to the surface, 0 for flat-sided shapes."""
+    match shape:
+        case Disc() | Sphere() | Capsule():
+            return floats(shape.radius)
+        case Box():
+            return jnp.zeros_like(floats(shape.half)[0])
+        case Polygon() | Hull():
+            return jnp.zeros_like(floats(shape.vertices)[0, 0])
+    return jnp.zeros_like(floats(shape.offset))
+
+
+def edges(shape: Shape, dim: int) -> tuple:
+    """Pairs (i, j), i < j, of `vertices` joined by an edge, for edge-edge contacts in 3D; static.
+
+    In 2D edges meet at vertices only, so there are none but the segment of a capsule.
+    """
+    if isinstance(shape, Capsule):
+        return ((0, 1),)
+    if isinstance(shape, Box) and dim == 3:
+        return _CUBE_EDGES
+    return _topology(shape)[1] if isinstance(shape, Hull) else ()
+
+
+def edge_apexes(shape: Shape, dim: int) -> tuple:
+    """For each of `edges`, a corner off it in each of the two faces that meet there; static.
+
+    For the segment of a capsule, which has no faces, one of its own ends.
+    """
+    if isinstance(shape, Hull):
+        apex = apexes(_topology(shape)[0])
+        return tuple((apex[i, j], apex[j, i]) for i, j in edges(shape, dim))
+    if isinstance(shape, Box) and dim == 3:
+        return tuple(tuple(k for k in range(8) if (i, k) in _BESIDE and k != j) for i, j in _CUBE_EDGES)
+    return tuple((i, i) for i, _ in edges(shape, dim))
+
+
+# ---- mass, centre of mass, inertia
+
+
+def mass_properties(shape: Shape, density: Array, dim: int) -> tuple[Array, Array, Array]:
+    """Mass, centre of mass and inertia of a homogeneous body, for one shape without batch axes.
+
+    Args:
+        density: [kg/m^2] in 2D, [kg/m^3] in 3D.
+
+    Returns:
+        mass () [kg]; centre of mass (D,) [m] in the shape's axes; inertia about the centre of mass in those
+        axes, () in 2D or (3, 3) in 3D [kg m^2].
+
+    Differentiable in the density and every leaf. A body without volume has no mass: see `volume_properties`.
+    """
+    volume, center, gyration = volume_properties(shape, dim)
+    mass = jnp.asarray(density, volume.dtype) * volume
+    return mass, center, mass * gyration
+
+
+def volume_properties(shape: Shape, dim: int) -> tuple[Array, Array, Array]:
+    """Area [m^2] or volume [m^3] (); centre of mass (D,) [m]; inertia per mass [m^2], () in 2D, (3, 3) in 3D.
+
+    When the mass is given, `mass * gyration` is the inertia, also for a rod or plate, whose volume is zero.
+    """
+    if dimension(shape) not in (None, dim):
+        name = type(shape).__name__
+        raise ValueError(f"this {name} is {dimension(shape)}D but dim is {dim}: use a shape of {dim}D.")
+    volume, center, second = _moments(shape, dim)
+    spread = jnp.trace(second)
+    return volume, center, spread if dim == 2 else spread * jnp.eye(3, dtype=second.dtype) - second
+
+
+def _moments(shape, dim):
+    """Volume (), centre (D,), and second moment about the centre per mass, <r r^T>, (D, D) [m^2]."""
+    match shape:
+        case Disc() | Sphere():
+            size = floats(shape.radius)
+            return _centred(_BALL[dim] * size**dim, jnp.full((dim,), size**2 / (dim + 2)))
+        case Box():
+            half = floats(shape.half)
+            return _centred(jnp.prod(2 * half), half**2 / 3)
+        case Capsule():
+            return _capsule_moments(floats(shape.radius), floats(shape.half_length), dim)
+        case Polygon():
+            start = np.arange(len(shape.vertices))
+            return _solid_moments(floats(shape.vertices), np.stack([start, np.roll(start, -1)], axis=1))
+        case Hull():
+            return _solid_moments(floats(shape.vertices), np.array(_topology(shape)[0]))
+    raise ValueError(f"{type(shape).__name__} has no finite mass: make it Static, or give the body a thick Box.")
+
+
+def _centred(volume, spread):
+    """Moments of a shape with its centre at the origin and mean squares `spread`, (D,) [m^2], of x, y, z."""
+    return volume, jnp.zeros_like(spread), jnp.diag(spread)
+
+
+def _capsule_moments(r, h, dim):
+    """Moments of a capsule of radius r and half length h, both () [m], in either dimension.
+
+    A cylinder of length 2 h, whose cross-section is a ball of one dimension less, and one ball cut in two
+    halves. In a ball of dimension n the mean of x_i^2 is r^2 / (n + 2), and the centroid of a half is
+    2 B(n - 1) / ((n + 1) B(n)) r from the cut, with B(n) the volume of the unit ball.
+    """
+    ball, core = (
+        _BALL[dim] * r,
+        2 * _BALL[dim - 1] * h,
+    )  # volumes over r^(dim - 1): that cancels in the fractions
+    part = ball / (ball + core)  # fraction of the mass in the ends; finite for r = 0
+    cut = 2 * _BALL[dim - 1] / ((dim + 1) * _BALL[dim]) * r
+    axial = part * (h**2 + 2 * h * cut + r**2 / (dim + 2)) + (1 - part) * h**2 / 3
+    lateral = part * r**2 / (dim + 2) + (1 - part) * r**2 / (dim + 1)
+    return _centred((ball + core) * r ** (dim - 1), jnp.stack([axial] + [lateral] * (dim - 1)))
+
+
+def _solid_moments(corners, faces):
+    """Moments of a solid with corners (V, D) and faces (F, D): signed simplices, faces to an inner point.
+
+    A simplex with one corner at the origin and the others a_1 ... a_D, with d = det(a) and s the sum of a_i,
+    has volume d / D!, integral of r: d s / (D + 1)!, of r r^T: d (sum a_i a_i^T + s s^T) / (D + 2)!. In 2D
+    these are the shoelace formulas. Source: Blow and Binstock, How to find the inertia tensor (2004).
+    """
+    dim = faces.shape[1]
+    inner = corners.mean(0)  # any point will do, but a far one would lose digits
+    a = corners[faces] - inner[None, None]
+    det, total = jnp.linalg.det(a), a.sum(1)
+    volume = det.sum() / math.factorial(dim)
+    offset = det @ total / math.factorial(dim + 1) / volume
+    squares = jnp.einsum("f,fci,fcj->ij", det, a, a) + jnp.einsum("f,fi,fj->ij", det, total, total)
+    second = squares / math.factorial(dim + 2) / volume - jnp.outer(offset, offset)
+    return volume, inner + offset, second
+
+
+# ---- topology of hulls
+
+
+def with_topology(shape: Shape) -> Shape:
+    """The shape, with `faces` and `edges` filled in if it is a hull that lacks them.
+
+    For traced vertices the faces must be given; the edges then include the diagonals of flat faces.
+    """
+    if not isinstance(shape, Hull):
+        return shape
+    faces, edges = _topology(shape)
+    return replace(shape, faces=faces, edges=edges)
+
+
+def _topology(hull: Hull) -> tuple[tuple, tuple]:
+    """Faces and edges of a hull, found where they are not given."""
+    unknown = traced(hull.vertices)
+    if hull.faces is None and unknown:
+        raise ValueError(
+            "Hull.vertices is traced, so its faces cannot be found: outside the traced function make "
+            "hull = with_topology(Hull(vertices=...)), inside it replace(hull, vertices=...)."
+        )
+    # static fields must hash, and faces may come as an array
+    faces = hull_faces(hull.vertices) if hull.faces is None else triples(hull.faces)
+    if hull.edges is not None:
+        return faces, hull.edges
+    return faces, hull_edges(faces, None if unknown else hull.vertices)
+
+
+def traced(leaf) -> bool:
+    """Whether a leaf, or a number in a tuple given for one, is known only when the program runs."""
+    return any(isinstance(part, jax.core.Tracer) for part in jax.tree.leaves(leaf))
+
+
+def floats(leaf) -> Array:
+    """A leaf as a float array; records may hold plain numbers and tuples until they are put into a world."""
+    leaf = jnp.asarray(leaf)
+    return leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf.astype(float)

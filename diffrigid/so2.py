@@ -1,0 +1,105 @@
+"""Rotations of the plane. The same verbs as `so3`, so that one code serves both.
+
+Orientation q = (cos, sin), (2, *batch); angular velocity and momentum have one component, (1, *batch); the
+inertia is a number, (*batch). Vectors (2, *batch). World and body rotation rates are the same in the plane.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from diffrigid.numerics import cos_sin, dot
+
+D, A, Q = 2, 1, 2  # components of a vector, of an angular velocity, of an orientation
+
+
+def perp(r: Array) -> Array:
+    """r turned by a quarter, (-y, x). By reversal, because XLA does not vectorise loops that stack components."""
+    sign = np.array([-1.0, 1.0], r.dtype).reshape(2, *[1] * (r.ndim - 1))
+    return jnp.multiply(sign, r[::-1])
+
+
+def rotate(q: Array, r: Array) -> Array:
+    """Body axes to world axes."""
+    return q[:1] * r + q[1:] * perp(r)
+
+
+def unrotate(q: Array, r: Array) -> Array:
+    """World axes to body axes."""
+    return q[:1] * r - q[1:] * perp(r)
+
+
+def compose(q: Array, p: Array) -> Array:
+    """First p, then q; brought back to unit length, so that rounding does not accumulate."""
+    product = rotate(q, p)  # of complex numbers
+    # One Newton step for 1 / |product| about 1: exact to rounding for products of unit vectors.
+    return product * (1.5 - 0.5 * dot(product, product))[None]
+
+
+def exp(phi: Array) -> Array:
+    """Orientation of the rotation by phi [rad], (1, *batch)."""
+    return jnp.concatenate(cos_sin(phi))
+
+
+def turn_by(phi: Array, q: Array) -> Array:
+    """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
+    return compose(exp(phi), q)
+
+
+def log(q: Array) -> Array:
+    """Angle of q in (-pi, pi], (1, *batch) [rad]."""
+    return jnp.arctan2(q[1:], q[:1])
+
+
+def cross(w: Array, r: Array) -> Array:
+    """w x r: velocity of a point at r on a body that spins with w."""
+    return w * perp(r)
+
+
+def moment(r: Array, F: Array) -> Array:
+    """r x F: torque of a force F at r, (1, *batch)."""
+    return dot(perp(r), F)[None]
+
+
+def inverse_inertia(inertia: Array) -> Array:
+    """1 / I [1/(kg m^2)]."""
+    return 1.0 / inertia
+
+
+def spin(inertia: Array, q: Array, w: Array) -> Array:
+    """Angular momentum L = I w, world axes [kg m^2/s]."""
+    del q
+    return inertia[None] * w
+
+
+def unspin(inverse: Array, q: Array, L: Array) -> Array:
+    """Angular velocity w = I^-1 L, world axes [rad/s], from the inverse inertia in body axes."""
+    del q
+    return inverse[None] * L
+
+
+def world_inverse(inverse: Array, q: Array) -> Array:
+    """Inverse inertia in world axes; `apply` multiplies by it."""
+    del q
+    return inverse
+
+
+def apply(inverse: Array, tau: Array) -> Array:
+    """I^-1 tau, (1, *batch), both in world axes."""
+    return inverse[None] * tau
+
+
+def mobility(inverse: Array, r: Array) -> Array:
+    """Velocity at r for a unit force impulse at r, by rotation alone: (2, 2, *batch), I^-1 r_perp r_perp^T."""
+    across = perp(r)
+    return inverse[None, None] * across[:, None] * across[None]
+
+
+def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
+    """Angle turned after time s as a power series, sum_k turn[k] s^(k+1); (2, 1, *batch).
+
+    Exact for a constant torque: w s + tau / I s^2 / 2.
+    """
+    del q
+    w = inverse[None] * L
+    return jnp.stack([w, jnp.zeros_like(w) if tau is None else 0.5 * inverse[None] * tau])

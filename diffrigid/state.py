@@ -1,0 +1,85 @@
+"""The kinematic state, the bodies' constants, and what follows from both: energy and momenta.
+
+x is the centre of mass, in the world frame; v and w are in the world frame. Nothing derivable is stored.
+"""
+
+from types import ModuleType
+
+import jax
+from jax import Array
+
+from diffrigid import so2, so3
+from diffrigid.pytree import array, pytree, static
+
+
+def rotations(dim: int) -> ModuleType:
+    """The module that knows rotations in `dim` dimensions: so2 or so3."""
+    return so2 if dim == 2 else so3
+
+
+@pytree
+class State:
+    """What a step changes. N bodies in D dimensions; A = 1 or 3, Q = 2 or 4 (see so2, so3)."""
+
+    x: Array = array("N", "D")  # (N, D, *batch) [m] centre of mass, world frame
+    q: Array = array("N", "Q")  # (N, Q, *batch) [-] orientation, body to world
+    v: Array = array("N", "D")  # (N, D, *batch) [m/s] velocity of the centre of mass, world frame
+    w: Array = array("N", "A")  # (N, A, *batch) [rad/s] angular velocity, world frame
+
+
+@pytree
+class Bodies:
+    """Constants of the moving bodies. Inertia about the centre of mass, in body axes."""
+
+    mass: Array = array("N")  # (N, *batch) [kg]
+    inertia: Array = array(lambda b: ("N",) if b.dim == 2 else ("N", "D", "D"))  # [kg m^2]
+    restitution: Array = array("N")  # (N, *batch) [-]
+    friction: Array = array("N")  # (N, *batch) [-]
+    dim: int = static()
+
+
+@pytree
+class Wrench:
+    """Force and torque on every body; the torque about the centre of mass. None: no torque at all."""
+
+    F: Array = array("N", "D")  # (N, D, *batch) [N] world frame
+    tau: Array | None = array("N", "A", default=None)  # (N, A, *batch) [N m] world frame
+
+
+def spin(bodies: Bodies, state: State) -> Array:
+    """Angular momentum of each body about its own centre of mass, (N, A, *batch) [kg m^2/s], world frame."""
+    return jax.vmap(rotations(bodies.dim).spin)(bodies.inertia, state.q, state.w)
+
+
+def kinetic_energy(bodies: Bodies, state: State) -> Array:
+    """Kinetic energy of each body, m v.v / 2 + w.L / 2, (N, *batch) [J]."""
+    linear = bodies.mass * (state.v * state.v).sum(1)
+    return 0.5 * (linear + (state.w * spin(bodies, state)).sum(1))
+
+
+def momentum(bodies: Bodies, state: State) -> Array:
+    """Linear momentum of each body, m v, (N, D, *batch) [kg m/s]."""
+    return bodies.mass[:, None] * state.v
+
+
+def angular_momentum(bodies: Bodies, state: State) -> Array:
+    """Angular momentum of each body about the world origin, x * p + L, (N, A, *batch) [kg m^2/s]."""
+    orbital = jax.vmap(rotations(bodies.dim).moment)(state.x, momentum(bodies, state))
+    return orbital + spin(bodies, state)
+
+
+def material_point(state: State, body: int, point: Array) -> Array:
+    """World position of a point fixed to a body, r = R r_b + x, (D, *batch) [m].
+
+    Args:
+        body: index of the body.
+        point: (D, *batch) [m], body axes, from the centre of mass.
+    """
+    so = rotations(state.x.shape[1])
+    return state.x[body] + so.rotate(state.q[body], point)
+
+
+def material_velocity(state: State, body: int, point: Array) -> Array:
+    """World velocity of a point fixed to a body, v + w x (R r_b), (D, *batch) [m/s]. Arguments as above."""
+    so = rotations(state.x.shape[1])
+    return state.v[body] + so.cross(state.w[body], so.rotate(state.q[body], point))

@@ -1,0 +1,55 @@
+"""The table of a fit, as text and as HTML."""
+
+import html
+from typing import Any
+
+import numpy as np
+
+HEADER = ("parameter", "value", "95 % interval", "unit", "")
+
+
+def rows(fit: Any) -> list[tuple[str, ...]]:
+    """One row for every number: name, value, interval, unit, note."""
+    out: list[tuple[str, ...]] = []
+    for p in fit.parameters:
+        for index in np.ndindex(p.value.shape):
+            name = p.name if not index else f"{p.name}[{', '.join(map(str, index))}]"
+            value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
+            digits = _digits(value, low, high)
+            interval = f"{low:.{digits}g} .. {high:.{digits}g}"
+            out.append((name, f"{value:.{digits}g}", interval, p.unit or "-", p.note))
+    return out
+
+
+def _digits(value: float, low: float, high: float) -> int:
+    """Digits that show the interval to two places."""
+    width, size = abs(high - low), max(abs(value), abs(low), abs(high))
+    if not np.isfinite(width) or width == 0 or size == 0:
+        return 4
+    return int(np.clip(np.ceil(np.log10(size / width)) + 2, 3, 12))
+
+
+def summary(fit: Any) -> str:
+    """One line on the starts, the noise and the time."""
+    noise = ", ".join(f"{name} {value:.3g}" for name, value in fit.noise.items())
+    return (
+        f"{fit.agree} of {len(fit.costs)} starts agree; noise: {noise}; {fit.seconds:.1f} s"
+        if len(fit.noise) <= 6
+        else f"{fit.agree} of {len(fit.costs)} starts agree; {fit.seconds:.1f} s"
+    )
+
+
+def text_table(fit: Any) -> str:
+    """The table in plain text."""
+    table = [HEADER, *rows(fit)]
+    widths = [max(len(row[i]) for row in table) for i in range(len(HEADER))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
+    rule = "-" * max(map(len, lines))
+    return "\n".join([lines[0], rule, *lines[1:], rule, summary(fit)])
+
+
+def html_table(fit: Any) -> str:
+    """The table for a notebook."""
+    head = "".join(f"<th>{cell}</th>" for cell in HEADER)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows(fit))
+    return f"<table><tr>{head}</tr>{body}</table><p>{html.escape(summary(fit))}</p>"

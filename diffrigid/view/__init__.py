@@ -1,0 +1,5 @@
+"""Drawing: outlines of shapes."""
+
+from diffrigid.view.outline import outline
+
+__all__ = ["outline"]

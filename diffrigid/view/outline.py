@@ -1,0 +1,72 @@
+"""Outlines of shapes: the lines that a drawing of one needs, NumPy."""
+
+import numpy as np
+
+from diffrigid.shapes import Capsule, Disc, HalfSpace, Shape, Sphere, edges, vertices
+
+REACH = 50.0  # [m] half width of a drawn half space
+
+
+def outline(shape: Shape, dim: int, points: int = 48):
+    """Lines to draw, NumPy: in 2D one closed polyline (P, 2) [m], in 3D a list of polylines (P_i, 3) [m].
+
+    Round parts have about `points` points a turn. A half space is a long segment (2, 2), or a large square.
+    """
+    return _outline_2d(shape, points) if dim == 2 else _outline_3d(shape, points)
+
+
+def _outline_2d(shape, points):
+    match shape:
+        case Disc():
+            return _circle(float(shape.radius), points)
+        case Capsule():
+            return _stadium(float(shape.radius), float(shape.half_length), points)
+        case HalfSpace():
+            normal = np.asarray(shape.normal)
+            along = np.array([-normal[1], normal[0]])
+            return float(shape.offset) * normal + REACH * np.stack([along, -along])
+    return _closed(np.asarray(vertices(shape, 2)))
+
+
+def _outline_3d(shape, points):
+    match shape:
+        case Sphere():
+            return [_raised(_circle(float(shape.radius), points), axes) for axes in ((0, 1), (1, 2), (2, 0))]
+        case Capsule():
+            return _capsule_lines(float(shape.radius), float(shape.half_length), points)
+        case HalfSpace():
+            normal = np.asarray(shape.normal)
+            across = np.linalg.svd(normal[None])[2][1:]  # two unit vectors that span the surface
+            square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
+            return [float(shape.offset) * normal + REACH * square @ across]
+    corners = np.asarray(vertices(shape, 3))
+    return [corners[list(pair)] for pair in edges(shape, 3)]
+
+
+def _capsule_lines(r, h, points):
+    """A ring at each end of the cylinder, and the two stadiums along it."""
+    ring, along = _raised(_circle(r, points), (1, 2)), _stadium(r, h, points)
+    end = np.array([h, 0.0, 0.0])
+    return [ring - end, ring + end, _raised(along, (0, 1)), _raised(along, (0, 2))]
+
+
+def _circle(r, points):
+    turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
+    return _closed(r * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+
+
+def _stadium(r, h, points):
+    turn = np.linspace(-np.pi / 2, np.pi / 2, points // 2 + 1)
+    right = np.stack([h + r * np.cos(turn), r * np.sin(turn)], axis=1)
+    return _closed(np.concatenate([right, -right]))
+
+
+def _closed(polyline):
+    return np.concatenate([polyline, polyline[:1]])
+
+
+def _raised(polyline, axes):
+    """A plane polyline (P, 2) put into the plane of two of the three axes, (P, 3)."""
+    raised = np.zeros((len(polyline), 3))
+    raised[:, axes] = polyline
+    return raised

@@ -1,0 +1,249 @@
+"""A report of fits as one HTML file that needs nothing else: tables, players, charts, text.
+
+    write_report("report.html", "Title", "What this is.", [Section(title="...", player=player(...))])
+
+Everything is drawn from numbers: charts are SVG made here, a player is a canvas with its data beside it
+(`report.js`). Colours follow the light or dark scheme of the browser (`report.css`).
+"""
+
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffrigid.state import State
+from diffrigid.view.outline import outline
+from diffrigid.world import World
+
+HEADER = ("parameter", "value", "95 % interval", "unit", "truth or published value")
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"  # nothing is ever loaded
+WIDTH, HEIGHT = 460, 250  # [px] of a chart
+LEFT, RIGHT, TOP, BOTTOM = 56, 12, 30, 42  # [px] its margins
+
+Row = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of a report, in the order in which it is shown."""
+
+    title: str
+    paragraphs: Sequence[str] = ()
+    table: Sequence[Row] = ()  # rows under HEADER
+    player: Mapping[str, Any] | None = None  # from `player`
+    charts: Sequence[str] = ()  # SVG, from `chart`
+    details: Mapping[str, str] | None = None  # summary -> HTML, folded away
+
+
+@dataclass(frozen=True)
+class Series:
+    """Points, or a line, of a chart; NaN is left out."""
+
+    x: np.ndarray
+    y: np.ndarray
+    name: str = ""  # of the legend; "" is not listed
+    colour: int = 0  # 0 to 2
+    points: bool = False
+
+
+def write_report(path: str | Path, title: str, lead: str, sections: Sequence[Section]) -> Path:
+    """Write the file and return its path. Text is escaped; charts and details are put in as they are."""
+    here = files(__package__)
+    style, script = ((here / name).read_text(encoding="utf-8") for name in ("report.css", "report.js"))
+    page = (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        f"<style>\n{style}</style></head>\n<body><main>\n<h1>{html.escape(title)}</h1>\n"
+        f'<p class="lead">{html.escape(lead)}</p>\n'
+        + "".join(map(_section, sections))
+        + f"</main>\n<script>\n{script}</script></body></html>\n"
+    )
+    path = Path(path)
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def row(name: str, values: Sequence[float] | np.ndarray, unit: str, reference: str) -> Row:
+    """One row of a table: value, low, high with as many digits as show the interval to two places."""
+    v, l, h = (float(number) for number in values)
+    digits = _digits(v, l, h)
+    value, low, high = (f"{number:#.{digits}g}".rstrip(".") for number in (v, l, h))
+    return name, value, f"{low} to {high}", unit, reference
+
+
+def text_table(rows: Sequence[Row]) -> str:
+    """Rows under HEADER, as text."""
+    table = [HEADER, *rows]
+    widths = [max(len(line[column]) for line in table) for column in range(len(HEADER))]
+    padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in table]
+    lines = ["  ".join(cells).rstrip() for cells in padded]
+    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+
+
+def html_table(rows: Sequence[Row]) -> str:
+    """Rows under HEADER, as HTML."""
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in HEADER)
+    lines = ["".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in rows]
+    body = "".join(f"<tr>{line}</tr>\n" for line in lines)
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>\n'
+
+
+def player(
+    world: World, t: np.ndarray, states: State, measured: Mapping[str, tuple[np.ndarray, np.ndarray | None]], *,
+    t_measured: np.ndarray, speed: float, shifts: np.ndarray | None = None, lines: Sequence[np.ndarray] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Data of a player: the motion of every body as an outline, over what was measured of it. 2D.
+
+    Args:
+        t: (T,) [s] of states, whose leaves have a leading time axis.
+        measured: by body, positions (M, 2) [m] and angles (M,) [rad], None if not measured, at t_measured (M,) [s].
+        speed: at which it starts, 1 is real time.
+        shifts: (N, 2) [m] where to draw each body apart from its place; default: in its place.
+        lines: polylines (P, 2) [m] that do not move, as drawn.
+    """
+    x, q = np.asarray(states.x, float), np.asarray(states.q, float)
+    angle = np.unwrap(np.arctan2(q[..., 1], q[..., 0]), axis=0)
+    shifts = np.zeros((len(world.names), 2)) if shifts is None else shifts
+    shapes, bodies = _outlines(world), []
+    for index, name in enumerate(world.names):
+        poses = np.column_stack([x[:, index] + shifts[index], angle[:, index]])
+        place, turn = measured.get(name, (np.full((len(t_measured), 2), np.nan), None))
+        turn = np.zeros(len(place)) if turn is None else turn
+        ghosts = np.column_stack([place + shifts[index], turn])
+        columns = {"outline": shapes[name], "fit": poses, "measured": ghosts}
+        bodies.append({"name": name} | {key: _numbers(column) for key, column in columns.items()})
+    return {
+        "t": _numbers(t), "t_measured": _numbers(t_measured), "speed": speed,
+        "bodies": bodies, "lines": [_numbers(line) for line in lines],
+    }  # fmt: skip
+
+
+def chart(title: str, x_label: str, y_label: str, series: Sequence[Series], width: int = WIDTH) -> str:
+    """A chart as SVG: axes with ticks, lines and points, a legend above."""
+    x_range = _range([s.x[np.isfinite(s.y)] for s in series], 0.0)
+    y_range = _range([s.y for s in series], 0.06)
+    right, bottom = width - RIGHT, HEIGHT - BOTTOM
+
+    def place(x, y):
+        across = LEFT + (right - LEFT) * (x - x_range[0]) / (x_range[1] - x_range[0])
+        return across, bottom - (bottom - TOP) * (y - y_range[0]) / (y_range[1] - y_range[0])
+
+    parts = [
+        f'<svg class="chart" viewBox="0 0 {width} {HEIGHT}" role="img" aria-label="{html.escape(title)}">',
+        _text("title", LEFT, 14, title, "start"),
+        *_axes(place, x_range, y_range, (right, bottom)),
+        _text("label", (LEFT + right) / 2, HEIGHT - 6, x_label, "middle"),
+        f'<g transform="translate(13 {(TOP + bottom) / 2}) rotate(-90)">{_text("label", 0, 0, y_label, "middle")}</g>',
+        *(_marks(s, place) for s in series),
+        _legend(series, right),
+    ]
+    return "".join(parts) + "</svg>\n"
+
+
+def _section(section: Section) -> str:
+    parts = [f"<section><h2>{html.escape(section.title)}</h2>\n"]
+    if section.table:
+        parts.append(html_table(section.table))
+    if section.player is not None:
+        data = json.dumps(section.player, separators=(",", ":")).replace("</", "<\\/")
+        parts.append(f'<figure class="player"><script type="application/json">{data}</script></figure>\n')
+    parts += [f"<p>{html.escape(paragraph)}</p>\n" for paragraph in section.paragraphs]
+    if section.charts:
+        parts.append('<div class="charts">\n' + "".join(section.charts) + "</div>\n")
+    for summary, content in (section.details or {}).items():
+        parts.append(f"<details><summary>{html.escape(summary)}</summary>\n")
+        parts.append(f'<div class="wide">{content}</div></details>\n')
+    return "".join(parts) + "</section>\n"
+
+
+def _digits(value: float, low: float, high: float) -> int:
+    """Significant digits that show the width of an interval to two places."""
+    width, size = abs(high - low), max(abs(value), abs(low), abs(high))
+    if not np.isfinite(width) or width == 0 or size == 0:
+        return 4
+    return int(np.clip(np.ceil(np.log10(size / width)) + 2, 2, 12))
+
+
+def _outlines(world: World) -> dict[str, np.ndarray]:
+    """Outline (P, 2) [m] of every body, about its centre of mass."""
+    found = {name: np.zeros((1, 2)) for name in world.names}
+    for shape, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
+        for index, owner in enumerate(owners):
+            if owner < len(world.names):
+                at = np.zeros(2) if offset is None else np.asarray(offset.r[index])
+                found[world.names[owner]] = outline(_row_of(shape, index), 2) + at
+    return found
+
+
+def _row_of(record: Any, index: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], record)
+
+
+def _numbers(array: Any) -> list:
+    """Nested lists with 5 decimals (10 micrometres); a row with NaN becomes None."""
+    array = np.round(np.asarray(array, float), 5)
+    if array.ndim == 1:
+        return array.tolist()
+    return [line.tolist() if np.isfinite(line).all() else None for line in array]
+
+
+def _range(columns: Sequence[np.ndarray], margin: float) -> tuple[float, float]:
+    values = np.concatenate([np.ravel(column) for column in columns])
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    pad = margin * (high - low) if high > low else 1.0
+    return low - pad, high + pad
+
+
+def _ticks(low: float, high: float) -> np.ndarray:
+    """About five round numbers between two numbers."""
+    raw = (high - low) / 5
+    unit = 10 ** np.floor(np.log10(raw))
+    step = unit * next(factor for factor in (1, 2, 5, 10) if factor * unit >= raw)
+    return step * (np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) + 0.0)  # + 0: not -0
+
+
+def _axes(place, x_range, y_range, corner) -> list[str]:
+    """Grid, tick labels, and the zero line where there is one."""
+    right, bottom = corner
+    parts = []
+    for tick in _ticks(*x_range):
+        x, _ = place(tick, y_range[0])
+        parts.append(f'<path class="grid" d="M{x:.1f} {TOP}V{bottom}"/>')
+        parts.append(_text("tick", x, bottom + 14, f"{tick:.6g}", "middle"))
+    for tick in _ticks(*y_range):
+        _, y = place(x_range[0], tick)
+        kind = "grid zero" if abs(tick) < 1e-12 else "grid"
+        parts.append(f'<path class="{kind}" d="M{LEFT} {y:.1f}H{right}"/>')
+        parts.append(_text("tick", LEFT - 6, y + 3.5, f"{tick:.6g}", "end"))
+    return parts
+
+
+def _marks(series: Series, place) -> str:
+    """Circles, or a line that is broken at NaN."""
+    known = np.isfinite(series.x) & np.isfinite(series.y)
+    x, y = place(series.x, series.y)
+    if series.points:
+        circles = [f'<circle cx="{x[i]:.1f}" cy="{y[i]:.1f}" r="2.2"/>' for i in np.flatnonzero(known)]
+        return f'<g class="c{series.colour}">{"".join(circles)}</g>'
+    begins = known & ~np.concatenate([[False], known[:-1]])
+    path = "".join(f"{'M' if begins[i] else 'L'}{x[i]:.1f} {y[i]:.1f}" for i in np.flatnonzero(known))
+    return f'<path class="line c{series.colour}" d="{path}"/>'
+
+
+def _legend(series: Sequence[Series], right: float) -> str:
+    """Names of the series and their marks, at the top right."""
+    named = [(f"c{s.colour}", "●" if s.points else "—", html.escape(s.name)) for s in series if s.name]
+    spans = "&#160;&#160; ".join(f'<tspan class="mark {kind}">{mark}</tspan> {name}' for kind, mark, name in named)
+    return f'<text class="tick" x="{right}" y="14" text-anchor="end">{spans}</text>'
+
+
+def _text(kind: str, x: float, y: float, text: str, anchor: str) -> str:
+    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{html.escape(text)}</text>'

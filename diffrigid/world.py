@@ -1,0 +1,111 @@
+"""`World`: everything that a step does not change, and the checks of shape and type."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid.collide import PairGroup
+from diffrigid.contact import Contact
+from diffrigid.pytree import array, map_arrays, pytree, stacked, static
+from diffrigid.state import Bodies, State
+
+
+@pytree
+class Statics:
+    """Poses and materials of the S colliders that do not move."""
+
+    x: Array = array("S", "D")  # (S, D, *batch) [m]
+    q: Array = array("S", "Q")  # (S, Q, *batch)
+    restitution: Array = array("S")  # (S, *batch) [-]
+    friction: Array = array("S")  # (S, *batch) [-]
+
+
+@pytree
+class World:
+    """N moving bodies, S statics, their shapes, forces and contact model. Every float leaf can be fitted.
+
+    Colliders are numbered bodies first, then statics. Shapes of one kind are stacked in one record, with a
+    leading axis; `owners` says on which collider each sits, and `offsets` where, if its origin is not the
+    centre of mass. Make it with `scene`; change it with `replace`.
+    """
+
+    bodies: Bodies
+    statics: Statics
+    shapes: tuple = stacked("M")
+    offsets: tuple  # of Offset or None, like shapes
+    forces: tuple
+    contact: Contact
+    names: tuple[str, ...] = static()  # of the moving bodies, in the order of State
+    static_names: tuple[str, ...] = static()
+    force_names: tuple[str, ...] = static()
+    owners: tuple[tuple[int, ...], ...] = static()
+    pairs: tuple[PairGroup, ...] = static()
+    own_restitution: tuple[bool, ...] = static()  # of each collider: given to it, not the scene's default
+    own_friction: tuple[bool, ...] = static()
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return self.bodies.dim
+
+
+@pytree
+class Offset:
+    """Where the origins of M shapes of one kind sit on their bodies."""
+
+    r: Array = array("M", "D")  # (M, D, *batch) [m] from the centre of mass, body axes
+
+
+def axis_sizes(world: World) -> dict[str, int]:
+    """Sizes of the axes that the letters stand for, in this world."""
+    dim = world.dim
+    sizes = {"N": len(world.names), "S": len(world.static_names)}
+    return sizes | {"D": dim, "A": 1 if dim == 2 else 3, "Q": 2 if dim == 2 else 4}
+
+
+def check(world: World, state: State) -> None:
+    """Raise ValueError where shapes or types of `state` and `world` do not fit. Costs nothing at run time."""
+    if not isinstance(world, World) or not isinstance(state, State):
+        raise ValueError(
+            f"expected (world, state), got ({type(world).__name__}, {type(state).__name__}): "
+            "both come from `diffrigid.scene`, in this order."
+        )
+    sizes = axis_sizes(world)
+    batches: dict[tuple[int, ...], str] = {}
+
+    def compare(leaf: Any, letters: tuple[str, ...], path: str):
+        shape = jnp.shape(leaf)
+        head = shape[: len(letters)]
+        known = [sizes.get(letter, size) for letter, size in zip(letters, head, strict=False)]
+        if len(head) < len(letters) or list(head) != known:
+            wanted = ", ".join(f"{l}={sizes[l]}" if l in sizes else l for l in letters)
+            raise ValueError(
+                f"{path} has shape {shape}, expected ({wanted}, *batch) in this {world.dim}D world of "
+                f"{sizes['N']} bodies: make world and state with the same `scene`, and put batch axes last "
+                "(or use rollout_batch)."
+            )
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise ValueError(
+                f"{path} has type {jnp.result_type(leaf)}, expected floating point: convert it with "
+                "jnp.asarray(..., float)."
+            )
+        batches.setdefault(shape[len(letters) :], path)
+        return leaf
+
+    map_arrays(compare, state, "state")
+    map_arrays(compare, world, "world")
+    _check_batches(batches)
+
+
+def _check_batches(batches: dict[tuple[int, ...], str]) -> None:
+    """Raise ValueError unless all batch axes, compared from the first, are equal or of length one."""
+    rank = max(map(len, batches))
+    for axis in range(rank):
+        lengths = {batch[axis]: path for batch, path in batches.items() if axis < len(batch) and batch[axis] != 1}
+        if len(lengths) > 1:
+            (n, first), (m, second), *_ = lengths.items()
+            raise ValueError(
+                f"batch axes do not fit: axis {axis} of the batch has length {n} in {first} but {m} in {second}; "
+                "give both the same length, or one of them length 1."
+            )

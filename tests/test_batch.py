@@ -1,0 +1,86 @@
+"""Batches: a leading batch axis outside, chunks inside, and the numbers of one world after another."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+
+WORLDS = 5
+ROUNDING = 1e-11  # loops over other lengths add in another order
+
+
+@pytest.fixture(scope="module")
+def many():
+    """Discs that collide on a floor, with other velocities and other restitutions in every world."""
+    world, state = dr.scene(
+        {
+            "a": dr.Body(dr.Disc(radius=0.2), mass=1.0, x=(0.0, 0.5), v=(1.0, 0.0)),
+            "b": dr.Body(dr.Disc(radius=0.3), mass=2.0, x=(1.0, 0.6)),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+        },
+        gravity=(0.0, -9.81),
+        friction=0.3,
+    )
+    v = state.v[None] + jnp.linspace(0.0, 0.5, WORLDS)[:, None, None]
+    e = jnp.linspace(0.2, 0.9, WORLDS)[:, None] * jnp.ones((1, 2))
+    bodies = dr.replace(world.bodies, restitution=e)
+    return world, state, dr.replace(world, bodies=bodies), dr.replace(state, v=v), v, e
+
+
+def one_by_one(world, state, v, e):
+    for i in range(WORLDS):
+        bodies = dr.replace(world.bodies, restitution=e[i])
+        yield dr.rollout(dr.replace(world, bodies=bodies), dr.replace(state, v=v[i]), dt=1 / 60, steps=40).state
+
+
+@pytest.mark.parametrize("chunk", [2, None])
+def test_batch_equals_loop(many, chunk):
+    world, state, worlds, states, v, e = many
+    batch = dr.rollout_batch(worlds, states, dt=1 / 60, steps=40, chunk=chunk)
+    for i, alone in enumerate(one_by_one(world, state, v, e)):
+        for name in ("x", "q", "v", "w"):
+            assert_allclose(getattr(batch, name)[i], getattr(alone, name), atol=ROUNDING, err_msg=name)
+
+
+def test_final_state_is_the_last(many):
+    _, _, worlds, states, _, _ = many
+    last = dr.rollout_batch(worlds, states, dt=1 / 60, steps=40, final_only=True)
+    every = dr.rollout_batch(worlds, states, dt=1 / 60, steps=40)
+    assert_allclose(last.x, every.x[:, -1], atol=ROUNDING)
+
+
+def test_gradient_of_a_batch_is_that_of_each_world():
+    world, state = dr.scene(
+        {
+            "ball": dr.Body(dr.Disc(radius=0.2), mass=1.0, x=(0.0, 0.5)),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+        },
+        gravity=(0.0, -9.81),
+        restitution=0.7,
+    )
+    v = jnp.stack([jnp.linspace(-1.0, 1.0, WORLDS), jnp.linspace(0.0, 0.5, WORLDS)], axis=1)[:, None]
+
+    def total(v):
+        last = dr.rollout_batch(world, dr.replace(state, v=v), dt=1 / 60, steps=24, final_only=True)
+        return jnp.sum(last.x**2)
+
+    def alone(v):
+        return jnp.sum(dr.rollout(world, dr.replace(state, v=v), dt=1 / 60, steps=24).state.x[-1] ** 2)
+
+    one = jax.jit(jax.jacfwd(alone))
+    assert_allclose(jax.jit(jax.grad(total))(v), np.stack([one(w) for w in v]), atol=1e-9)
+
+
+def test_bad_batches(many):
+    world, state, _, states, _, _ = many
+    with pytest.raises(ValueError, match="one leading batch axis"):
+        dr.rollout_batch(world, state, dt=1 / 60, steps=3)
+    with pytest.raises(ValueError, match="one leading batch axis"):
+        dr.rollout_batch(world, dr.replace(states, x=jnp.zeros((3, 2, 2))), dt=1 / 60, steps=3)
+    with pytest.raises(ValueError, match="dt > 0"):
+        dr.rollout_batch(world, states, dt=0.0, steps=3)
+    with pytest.raises(ValueError, match="steps >= 1"):
+        dr.rollout_batch(world, states, dt=1 / 60, steps=0)

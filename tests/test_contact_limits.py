@@ -1,0 +1,223 @@
+"""Where contact is singular or rare: very fast, at rest, grazing, exactly parallel, coincident."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_form import (
+    PAIR,
+    bouncing,
+    box_and_plane,
+    disc_and_plane,
+    fall,
+    final,
+    made,
+    pulled_back,
+    steps_near,
+    two_boxes,
+    two_discs,
+    vector,
+)  # fmt: skip
+from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+
+EXACT = 1e-9  # relative: rounding of a few hundred steps
+AT_REST = 1e-9  # [m], [m/s]: rounding of a body that is held for a thousand steps
+G = 9.81
+
+
+def run(make, parameters, t, rate=60):
+    """State at t and its Jacobian by all float leaves, as a pair (world, state) of arrays with the outputs in front."""
+    world, state = made(make, parameters)
+    blocks, dt = steps_near(t, rate)
+    end, by_leaf = final(world, state, dt, blocks)
+    return ravel_pytree(state)[1](end), jax.vmap(ravel_pytree((world, state))[1])(by_leaf)
+
+
+# ---- no tunnelling
+
+
+def bullets(speed, angle, spin):
+    """A disc and a spinning box shot at a thin wall, and a disc shot at its like: each less thick than it flies in a step."""
+    wall = dr.Box(half=vector(0.01, 50.0))
+    small = dr.Disc(radius=0.1)
+    bodies = {
+        "disc": dr.Body(small, mass=1.0, x=vector(0.0, 0.0), v=vector(speed, 0.0)),
+        "box": dr.Body(
+            dr.Box(half=vector(0.2, 0.1)), mass=1.0, x=vector(0.0, 3.0), v=vector(speed, 0.0), angle=angle, w=spin
+        ),
+        "shot": dr.Body(small, mass=1.0, x=vector(0.0, 6.0), v=vector(speed, 0.0)),
+        "target": dr.Body(small, mass=2.0, x=vector(20.0, 6.0)),
+        "wall": dr.Static(wall, x=vector(15.0, 0.0)),
+    }
+    lanes = [("disc", "box"), ("disc", "shot"), ("disc", "target"), ("box", "shot"), ("box", "target")]
+    return dr.scene(bodies, restitution=1.0, ignore=lanes + [("shot", "wall"), ("target", "wall")])
+
+
+def test_nothing_tunnels():
+    rng = np.random.default_rng(0)
+    speeds = np.concatenate([[500.0], rng.uniform(50.0, 500.0, 15)])
+    angles, spins = rng.uniform(0.0, 6.3, 16), rng.uniform(-60.0, 60.0, 16)
+
+    @jax.jit
+    @jax.vmap
+    def shots(speed, angle, spin):
+        world, state = bullets(speed, angle, spin)
+        states = dr.rollout(world, state, dt=40.0 / speed / 8, steps=8).state  # 5 m a step, 40 m in all
+        corner = jax.vmap(jax.vmap(dr.material_point, (None, None, 0)), (0, None, None))
+        corners = corner(states, 1, jnp.asarray([(0.2, 0.1), (-0.2, 0.1), (0.2, -0.1), (-0.2, -0.1)]))
+        return (
+            states,
+            corners[:, :, 0].max(),
+            dr.kinetic_energy(world.bodies, jax.tree.map(lambda leaf: leaf[-1], states)),
+        )
+
+    states, furthest, energy = shots(speeds, angles, spins)
+    face = 15.0 - 0.01 - 0.1
+    assert_allclose(states.x[:, -1, 0, 0], 2 * face - 40.0, rtol=EXACT)
+    assert_allclose(states.v[:, -1, 0, 0], -speeds, rtol=EXACT)
+    assert_allclose(states.v[:, -1, 2:, 0], speeds[:, None] * np.array([-1 / 3, 2 / 3]), rtol=EXACT)  # elastic, 1 to 2
+    assert_allclose(states.x[:, -1, 3, 0], 20.0 + 2 / 3 * (40.0 - 19.8), rtol=EXACT)
+    assert furthest.max() < 14.99 + EXACT
+    assert (states.v[:, -1, 1, 0] < 0).all()
+    inertia = (0.4**2 + 0.2**2) / 12
+    assert_allclose(energy[:, 1], 0.5 * speeds**2 + 0.5 * inertia * spins**2, rtol=EXACT)
+
+
+# ---- rest
+
+
+@pytest.mark.parametrize("rate", [60, 240])
+def test_ball_comes_to_rest_on_the_floor_and_stays(rate):
+    """Infinitely many bounces end at 1.2 s. Then the height is the radius, whatever it started from."""
+    state, jac = run(disc_and_plane, dict(e=0.6, y=0.9, r=0.1, g=G), 6.0, rate)
+    assert_allclose(state.x[0], [0.0, 0.1], atol=AT_REST)
+    assert_allclose(state.v[0], 0.0, atol=AT_REST)
+    y = 1  # row of the outputs
+    assert_allclose(jac[1].x[y], 0.0, atol=1e-6)  # d y / d start
+    assert_allclose(jac[0].shapes[0].radius[y], 1.0, atol=1e-6)
+    assert_allclose(jac[0].bodies.restitution[y], 0.0, atol=1e-6)
+    assert np.isfinite(ravel_pytree(jac)[0]).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3])
+def test_box_on_the_ground_stays(angle):
+    """On the level and, with friction above tan(angle), on a slope."""
+    n = np.array([np.sin(angle), np.cos(angle)])
+    p = dict(mu=0.5, e=0.5, half_y=0.1, x=0.1 * n[0], y=0.1 * n[1], angle=-angle, tilt=angle, g=G)
+    state, jac = run(box_and_plane, p, 5.0)
+    assert_allclose(state.x[0], 0.1 * n, atol=AT_REST)
+    assert_allclose(state.q[0], [np.cos(angle), -np.sin(angle)], atol=AT_REST)
+    assert_allclose(np.concatenate([state.v[0], state.w[0]]), 0.0, atol=AT_REST)
+    assert np.isfinite(ravel_pytree(jac)[0]).all()
+
+
+def test_flat_box_rebounds_flat():
+    """Both corners strike at once and share the impulse: v = -e v, no spin, with friction or without."""
+    for mu in (0.0, 0.4):
+        p = dict(e=0.5, mu=mu, half_y=0.05, y=0.5, vy=-1.0, g=G, m=2.0, inertia=0.06)
+        state, _ = run(box_and_plane, p, 0.35)
+        exact = bouncing(1)(0.35, 0.5, 0.5, -1.0, G, 0.05)
+        jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), state, exact)
+
+
+def test_flat_box_rebounds_flat_and_then_rests_in_space():
+    """Four corners at once; between the first two impacts, and long after the last."""
+
+    @jax.jit
+    def states(mu):
+        half = vector(0.3, 0.4, 0.1)
+        box = dr.Body(dr.Box(half=half), mass=2.0, x=vector(1.0, 2.0, 0.3), v=vector(0.0, 0.0, -1.0))
+        floor = dr.Static(dr.HalfSpace(normal=vector(0.0, 0.0, 1.0)))
+        world, state = dr.scene(
+            {"box": box, "floor": floor}, gravity=vector(0.0, 0.0, -G), restitution=0.5, friction=mu
+        )
+        return dr.rollout(world, state, dt=1 / 60, steps=240).state
+
+    speed, hit = fall(0.2, -1.0, G)
+    between = slice(8, 21)  # frames after the first impact, at 0.12 s, and before the second, at 0.35 s
+    after = np.arange(61)[between] / 60 - hit
+    for mu in (0.0, 0.4):
+        s = states(mu)
+        assert_allclose(s.x[between, 0, 2], 0.1 + 0.5 * speed * after - G * after**2 / 2, atol=EXACT)
+        assert_allclose(s.v[between, 0, 2], 0.5 * speed - G * after, atol=EXACT)
+        assert_allclose(s.w, 0.0, atol=EXACT)
+        assert_allclose(s.x[-60:, 0], np.broadcast_to([1.0, 2.0, 0.1], (60, 3)), atol=AT_REST)
+        assert_allclose(s.v[-60:], 0.0, atol=AT_REST)
+
+
+# ---- where a formula could divide by zero
+
+
+DISCS = PAIR | dict(
+    mu=0.3, ra=0.2, rb=0.2, xa=0.0, ya=0.0, xb=1.0, yb=0.0, vxa=2.0, vya=0.0, vxb=0.0, vyb=0.0, wa=0.0, wb=0.0
+)
+SINGULAR_DISCS = {
+    "graze": dict(yb=0.4),
+    "almost graze": dict(yb=0.4 - 1e-12),
+    "concentric": dict(xb=0.0),
+    "concentric at rest": dict(xb=0.0, vxa=0.0),
+    "no velocity": dict(vxa=0.0),
+    "touch at rest": dict(xb=0.4, vxa=0.0),
+    "touch and part": dict(xb=0.4, vxa=-1.0),
+    "touch and close": dict(xb=0.4),
+    "touch and slide past": dict(xb=0.4, vxa=0.0, vya=1.0),
+    "same velocity": dict(vxb=2.0),
+    "no friction": dict(mu=0.0, yb=0.1),
+    "no restitution": dict(e=0.0, yb=0.1),
+    "neither": dict(e=0.0, mu=0.0, yb=0.1),
+    "head on, no slip": dict(mu=0.5),
+}
+
+
+@pytest.mark.parametrize("name", SINGULAR_DISCS)
+def test_singular_discs_have_finite_state_and_gradient(name):
+    """In both modes, by every float leaf of World and State."""
+    p = DISCS | SINGULAR_DISCS[name]
+    state, jac = run(two_discs, p, 1.0)
+    assert np.isfinite(ravel_pytree(state)[0]).all()
+    assert np.isfinite(ravel_pytree(jac)[0]).all()
+    world, start = made(two_discs, p)
+    blocks, dt = steps_near(1.0, 60)
+    weights = jnp.ones_like(ravel_pytree(start)[0])
+    assert np.isfinite(pulled_back(world, start, dt, 60, weights)).all()
+    assert_allclose(state.v[0] * p["ma"] + state.v[1] * p["mb"], [p["vxa"] + p["mb"] * p["vxb"], p["vya"]], atol=EXACT)
+
+
+BOXES = dict(
+    e=0.5, mu=0.3, xa=0.0, ya=0.0, xb=1.0, yb=0.0, vxa=2.0, vya=0.0, vxb=0.0, vyb=0.0, angle_a=0.0, angle_b=0.0, wa=0.0, wb=0.0
+)  # fmt: skip
+SINGULAR_BOXES = {
+    "parallel faces": dict(),
+    "parallel faces, offset": dict(yb=0.2),
+    "parallel faces that rest": dict(e=0.0),
+    "parallel faces that touch": dict(xb=0.6, vxa=0.0),
+    "parallel faces that slide past": dict(xb=0.6, vxa=0.0, vya=1.0),
+    "no velocity": dict(vxa=0.0),
+    "corner on corner": dict(yb=0.4),
+    "corner on face": dict(angle_b=np.pi / 4),
+    "same place": dict(xb=0.0),
+    "neither restitution nor friction": dict(e=0.0, mu=0.0, angle_b=0.3, yb=0.1),
+}
+
+
+@pytest.mark.parametrize("name", SINGULAR_BOXES)
+def test_singular_boxes_have_finite_state_and_gradient(name):
+    p = BOXES | SINGULAR_BOXES[name]
+    state, jac = run(two_boxes, p, 0.5)
+    assert np.isfinite(ravel_pytree(state)[0]).all()
+    assert np.isfinite(ravel_pytree(jac)[0]).all()
+    assert_allclose(state.v[0] + 1.5 * state.v[1], [p["vxa"], p["vya"]], atol=EXACT)
+
+
+def test_parallel_faces_share_the_impulse():
+    """Centred boxes rebound as points do; the gradient by the velocities is that of the one-dimensional law."""
+    state, jac = run(two_boxes, BOXES, 0.5)
+    m, e = np.array([1.0, 1.5]), 0.5
+    by_speed = np.array([[m[0] - e * m[1], (1 + e) * m[1]], [(1 + e) * m[0], m[1] - e * m[0]]]) / m.sum()
+    assert_allclose(state.v[:, 0], 2.0 * by_speed[:, 0], rtol=EXACT)
+    assert_allclose(state.w, 0.0, atol=EXACT)
+    rows = np.array([8, 10])  # the x components of v, after x and q
+    assert_allclose(jac[1].v[rows, :, 0], by_speed, atol=EXACT)

@@ -1,0 +1,113 @@
+"""The fit: known parameters from noisy and partly missing records, honest intervals, clear errors."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+from diffrigid.sysid.free import Free
+
+NOISE = 3e-3  # [m]
+TRUTH = {"restitution": 0.8, "d1.mass": 2.0, "d0.v": np.array([2.0, 0.1])}
+
+
+def discs(restitution, mass, v):
+    places = ((1.0, (0.0, 0.0), v), (mass, (1.5, 0.1), (0.0, 0.0)), (1.0, (3.2, 0.35), (0.0, 0.0)))
+    return dr.scene(
+        {f"d{i}": dr.Body(dr.Disc(radius=0.4), mass=m, x=x, v=w) for i, (m, x, w) in enumerate(places)},
+        restitution=restitution,
+    )
+
+
+def record(seed):
+    """Two impacts, 120 frames at 60 Hz, a tenth of the numbers missing."""
+    random = np.random.default_rng(seed)
+    x = np.asarray(dr.rollout(*discs(0.8, 2.0, (2.0, 0.1)), dt=1 / 60, steps=119).state.x)
+    x = x + NOISE * random.standard_normal(x.shape)
+    x[random.random(x.shape) < 0.1] = np.nan
+    return {"t": np.arange(120) / 60, **{f"d{i}.x": x[:, i] for i in range(3)}}
+
+
+@pytest.fixture(scope="module")
+def fit():
+    free = {"restitution": dr.interval(0, 1), "d1.mass": dr.positive(), "d0.v": dr.real()}
+    widths = (0.5, 0.1, 0.0)  # from two thirds of the sum of the radii: starts that miss find the impacts
+    return dr.fit(*discs(0.5, 1.0, (1.5, 0.0)), record(1), free=free, starts=8, widths=widths, progress=False)
+
+
+def test_three_discs_find_the_truth_from_seven_of_eight_starts(fit):
+    for name, truth in TRUTH.items():
+        parameter = fit[name]
+        width = parameter.high - parameter.low
+        # Within twice the 95 % interval: four numbers each inside theirs would be too much to ask of one record.
+        assert np.all(np.abs(parameter.value - truth) < width), name
+        assert np.all(width < 0.01 * np.abs(parameter.value) + 0.01), name
+    assert fit.agree >= 7
+
+
+def test_noise_is_that_of_the_record(fit):
+    # 108 x 2 numbers a column: the estimate scatters by 5 %.
+    assert_allclose(list(fit.noise.values()), NOISE, rtol=0.15)
+
+
+def test_fitted_world_moves_as_the_truth(fit):
+    exact = dr.rollout(*discs(0.8, 2.0, (2.0, 0.1)), dt=1 / 60, steps=119)
+    assert_allclose(fit.trajectory.state.x, exact.state.x, atol=NOISE)
+
+
+def test_table_names_every_number_with_its_unit(fit):
+    text = repr(fit)
+    for word in ("restitution", "d1.mass", "kg", "d0.v[0]", "d0.v[1]", "m/s", "95 %", "of 8 starts agree"):
+        assert word in text
+    assert fit._repr_html_().count("<tr>") == 5
+
+
+def test_a_parameter_nothing_depends_on_is_an_error():
+    world, state = discs(0.5, 1.0, (1.5, 0.0))
+    data = record(2)
+    early = {name: values[:10] for name, values in data.items()}  # before the first impact
+    with pytest.raises(ValueError, match="depends on restitution"):
+        dr.fit(world, state, early, free={"restitution": dr.interval(0, 1), "d0.v": dr.real()}, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: {k: v for k, v in d.items() if k != "t"}, '"t"'),
+        (lambda d: d | {"d0.y": d["d0.x"]}, "did you mean d0"),
+        (lambda d: d | {"d0.x": d["d0.x"][:5]}, r"expected \(120, 2\)"),
+        (lambda d: d | {"t": d["t"][::-1]}, "increasing"),
+        (
+            lambda d: {k: v if k == "t" else np.full_like(v, np.nan) for k, v in d.items()},
+            "nothing is measured",
+        ),
+    ],
+)
+def test_bad_records(change, message):
+    with pytest.raises(ValueError, match=message):
+        dr.fit(*discs(0.5, 1.0, (1.5, 0.0)), change(record(3)), free={"d0.v": dr.real()}, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        ({}, "nothing to fit"),
+        ({"d0.mas": dr.positive()}, "did you mean d0.mass"),
+        ({"d0.mass": (0, 1)}, "expected interval"),
+    ],
+)
+def test_bad_free(free, message):
+    with pytest.raises(ValueError, match=message):
+        dr.fit(*discs(0.5, 1.0, (1.5, 0.0)), record(4), free=free, progress=False)
+
+
+@pytest.mark.parametrize("free", [Free(), Free(low=0.0), Free(low=-1.0, high=3.0)])
+def test_transforms_are_inverse(free):
+    values = np.array([0.3, 0.9, 2.5])
+    assert_allclose(free.value(free.unbounded(values)), values, rtol=1e-12)
+
+
+def test_a_start_on_a_bound_is_pulled_off_it():
+    assert np.isfinite(dr.interval(0, 1).unbounded(np.array([0.0, 1.0]))).all()
+    with pytest.raises(ValueError, match="low < high"):
+        dr.interval(1, 0)

@@ -1,0 +1,157 @@
+"""The whole job of `python -m diffrigid`, once, and the parts of it that have an exact answer."""
+
+import contextlib
+import io
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from diffrigid.__main__ import leave_one_out, main
+from diffrigid.data import FRAME, square_drops
+from diffrigid.view.report import Series, chart, row, text_table
+
+PUBLISHED = {  # range that the published values of the square, and their scatter, allow
+    "square: restitution": (0.35, 0.6),
+    "square: friction": (0.02, 0.2),
+    "square: radius of gyration": (18.0, 27.0),
+    "square: height of the floor": (-4.0, 3.0),
+}
+MARGIN = 1.5  # half widths of a 95 % interval within which a truth has to lie: 99.7 %, with the seed fixed
+
+
+class Page(HTMLParser):
+    """Open tags, to see that they close, and what would be loaded."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.loaded, self.tags = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.loaded += [value for name, value in attrs if name in ("src", "href", "action", "data")]
+        if tag not in ("meta", "link", "br", "input", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory):
+    """The page, and the table by name: value, low, high, reference."""
+    path, said = tmp_path_factory.mktemp("report") / "report.html", io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main(["--out", str(path), "--quiet"]) == 0
+    table = {}
+    for line in said.getvalue().splitlines():
+        cells = re.split(r"\s{2,}", line)
+        if line.startswith(("square:", "discs:")):
+            low, high = cells[2].split(" to ")
+            table[cells[0]] = (float(cells[1]), float(low), float(high), cells[4])
+    assert str(path) in said.getvalue()
+    return path.read_text(encoding="utf-8"), table
+
+
+@pytest.mark.slow
+def test_discs_give_back_what_was_put_in(job):
+    rows = {name: values for name, values in job[1].items() if name.startswith("discs")}
+    assert len(rows) == 4
+    for value, low, high, reference in rows.values():
+        truth = float(reference)
+        assert abs(truth - value) < MARGIN * (high - low) / 2
+        assert high - low < 0.01 * max(abs(truth), 0.5)  # 3 mm on 1 m, 121 times
+
+
+@pytest.mark.slow
+def test_square_agrees_with_what_was_published(job):
+    rows = {name: values for name, values in job[1].items() if name.startswith("square")}
+    assert set(rows) == set(PUBLISHED)
+    for name, (value, low, high, _) in rows.items():
+        assert PUBLISHED[name][0] < value < PUBLISHED[name][1]
+        assert low < value < high
+    assert rows["square: restitution"][1] < 0.47 < rows["square: restitution"][2]
+    assert rows["square: radius of gyration"][1] < 24.5 < rows["square: radius of gyration"][2]
+
+
+@pytest.mark.slow
+def test_report_is_one_closed_page_that_loads_nothing(job):
+    text, page = job[0], Page()
+    page.feed(text)
+    page.close()
+    assert page.open == [] and page.loaded == []
+    assert not re.search(r"(src|href)\s*=\s*[\"']?\s*https?:", text) and "@import" not in text and "url(" not in text
+    assert {"table", "svg", "figure", "details"} <= set(page.tags)
+    assert "nan" not in re.sub(r"(?s)<script.*?</script>", "", text).lower().split()
+
+
+@pytest.mark.slow
+def test_players_show_the_fit_over_what_was_measured(job):
+    """Fitted and measured centres agree to 4 mm for the square, and to 5 sigma for the discs."""
+    players = [json.loads(data) for data in re.findall(r'<script type="application/json">(.*?)</script>', job[0], re.S)]
+    assert [len(player["bodies"]) for player in players] == [8, 3]
+    for player, tolerance in zip(players, (4e-3, 15e-3), strict=True):
+        t, t_measured = np.array(player["t"]), np.array(player["t_measured"])
+        for body in player["bodies"]:
+            known = np.array([pose is not None for pose in body["measured"]])
+            assert known.sum() > 20
+            seen, fit = np.array([pose for pose in body["measured"] if pose]), np.array(body["fit"])
+            for axis in (0, 1):
+                np.testing.assert_allclose(np.interp(t_measured[known], t, fit[:, axis]), seen[:, axis], atol=tolerance)
+
+
+def test_square_drops_fall_freely_after_the_impact():
+    """In metres and seconds: over the last 15 frames, a = -g - drag v; and the spin is steady, in radians."""
+    record = square_drops()
+    assert len(record.trial) == 8 and np.isnan(record.angle).sum() < 8
+    t, missing = FRAME * np.arange(15), []
+    for x, angle in zip(record.x, record.angle, strict=True):
+        end = np.isfinite(angle).sum()
+        curvature, slope, _ = np.polyfit(t, x[end - 15 : end, 1], 2)
+        v = slope + 2 * curvature * t.mean()
+        missing.append(2 * curvature + record.gravity + record.drag[1] * v)
+        spin = np.polyval(np.polyfit(t, angle[end - 15 : end], 1), t)
+        np.testing.assert_allclose(angle[end - 15 : end], spin, atol=np.radians(1.0))
+    assert abs(np.mean(missing)) < 0.3  # 0.1 mm of noise is 0.2 m/s^2 in a drop, 0.08 in the mean
+
+
+def test_leaving_out_a_drop_is_exact_where_the_model_is_linear():
+    random = np.random.default_rng(0)
+    drops, m, shared, own = 5, 12, 4, 6
+    A, C, y = (random.normal(size=(drops, m, k)) for k in (shared, own, 1))
+
+    def solve(rows):
+        full = np.zeros((len(rows) * m, shared + len(rows) * own))
+        for k, b in enumerate(rows):
+            full[k * m : (k + 1) * m, :shared] = A[b]
+            full[k * m : (k + 1) * m, shared + k * own : shared + (k + 1) * own] = C[b]
+        z = np.linalg.lstsq(full, y[rows].reshape(-1), rcond=None)[0]
+        return z[:shared], (full @ z - y[rows].reshape(-1)).reshape(len(rows), m)
+
+    best, r = solve(list(range(drops)))
+    steps = np.moveaxis(np.concatenate([A, C], axis=2), -1, 0)
+    moved = leave_one_out(np.concatenate([r[None], r + steps, r - steps]))
+    for b in range(drops):
+        without, _ = solve([k for k in range(drops) if k != b])
+        np.testing.assert_allclose(moved[b], without - best, rtol=1e-8, atol=1e-10)
+
+
+def test_tables_show_intervals_to_two_places():
+    line = row("e", (0.45405, 0.4016, 0.5066), "-", "0.47")
+    assert line[1:3] == ("0.454", "0.402 to 0.507")
+    assert text_table([line]).splitlines()[2] == "e          0.454  0.402 to 0.507  -     0.47"
+
+
+def test_charts_break_at_nan_and_escape_names():
+    x = np.arange(5.0)
+    svg = chart("a < b", "t [s]", "x [m]", [Series(x, np.array([0.0, 1.0, np.nan, 1.0, 2.0]), "a & b")])
+    assert "a &lt; b" in svg and "a &amp; b" in svg
+    assert re.search(r'class="line c0" d="M[^M]*M[^M]*"', svg)  # two pieces
+    page = Page()
+    page.feed(svg)
+    assert page.open == []

@@ -1,0 +1,150 @@
+"""Names of parameters: what is written is read back, and nothing else has moved."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import diffrigid as dr
+from diffrigid import paths, so2
+
+FLAT = dr.scene(
+    {
+        "cue": dr.Body(dr.Disc(radius=0.4), mass=1.0, x=(0.0, 0.0), v=(1.5, 0.0), restitution=0.3),
+        "ball": dr.Body(dr.Disc(radius=0.3), mass=1.2, x=(1.5, 0.1), angle=0.4, w=0.2),
+        "block": dr.Body(dr.Polygon(vertices=((0, 0), (1, 0), (0, 1))), density=2.0, x=(5.0, 0.0)),
+        "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0), offset=-1.0)),
+        "wall": dr.Static(dr.Box(half=(0.1, 2.0)), x=(-3.0, 0.0), angle=0.1, friction=0.9),
+    },
+    gravity=(0.0, -9.81),
+    friction=0.2,
+    forces={
+        "air": dr.Drag(linear=0.1),
+        "rope": dr.SpringDamper(a="cue", b="ball", anchor_a=(0, 0), anchor_b=(0.1, 0), stiffness=3.0),
+        "push": dr.Force(body="block", F=(1.0, 0.0)),
+        "motor": dr.Torque(body="cue", tau=0.5),
+    },
+)
+SOLID = dr.scene(
+    {
+        "die": dr.Body(dr.Box(half=(0.1, 0.1, 0.1)), mass=0.02, x=(0, 0, 1)),
+        "rod": dr.Body(dr.Capsule(radius=0.1, half_length=0.4), density=500, x=(1, 0, 1), w=(0, 0, 2)),
+        "point": dr.Body(None, mass=1.0, inertia=(1, 1, 1), x=(9, 0, 0)),
+        "ground": dr.Static(dr.HalfSpace(normal=(0, 0, 1))),
+    },
+    gravity=(0, 0, -9.81),
+    forces=[dr.Drag(linear=(0.1, 0.2, 0.3), angular=0.01), dr.Drag()],
+)
+CASES = [(scene, path) for scene in (FLAT, SOLID) for path in sorted(paths._catalogue(scene[0]))]
+cases = pytest.mark.parametrize("scene, path", CASES, ids=[f"{s[0].dim}D {path}" for s, path in CASES])
+BODIES = {"mass", "inertia", "restitution", "friction", "x", "q", "v", "w"}
+
+
+def test_every_leaf_has_a_path():
+    expected = {f"{name}.{field}" for name in ("cue", "ball", "block") for field in BODIES | {"angle"}}
+    expected |= {
+        f"{name}.{field}" for name in ("floor", "wall") for field in ("x", "q", "angle", "restitution", "friction")
+    }
+    expected |= {"cue.shape.radius", "ball.shape.radius", "block.shape.vertices", "wall.shape.half"}
+    expected |= {"floor.shape.normal", "floor.shape.offset", "restitution", "friction", "gravity", "gravity.g"}
+    expected |= {"air.linear", "air.angular", "push.F", "motor.tau", "contact.width", "contact.rest_speed"}
+    expected |= {f"rope.{field}" for field in ("anchor_a", "anchor_b", "stiffness", "damping", "length")}
+    assert set(paths._catalogue(FLAT[0])) == expected
+    assert {"die.inertia", "rod.shape.half_length", "drag.linear", "drag1.angular"} < set(paths._catalogue(SOLID[0]))
+
+
+def changed_rows(before, after):
+    """Leaves that differ, as {number of the leaf: rows of it}."""
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+    found = {}
+    for i, (a, b) in enumerate(zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)):
+        assert a.dtype == b.dtype and a.shape == b.shape
+        if rows := {int(at[0]) if len(at) else 0 for at in np.argwhere(a != b)}:
+            found[i] = rows
+    return found
+
+
+@cases
+def test_round_trip(scene, path):
+    world, state = scene
+    old = np.asarray(paths.read(world, state, path))
+    new = old + 0.125 + 0.25 * np.arange(old.size).reshape(old.shape)
+    changed = paths.write(world, state, path, new)
+    assert_allclose(paths.read(*changed, path), new, rtol=1e-15)
+    moved = changed_rows(scene, changed)
+    assert len(moved) == (2 if path in ("restitution", "friction") else 1)  # those are of bodies and statics
+    if path.split(".")[0] in world.names + world.static_names:
+        assert [len(rows) for rows in moved.values()] == [1]  # no other body
+
+
+@pytest.mark.parametrize("scene", (FLAT, SOLID), ids=("2D", "3D"))
+def test_write_traces_and_is_differentiable(scene):
+    values = {path: paths.read(*scene, path) for path in paths._catalogue(scene[0])}
+
+    def total(values):
+        return sum(paths.read(*paths.write(*scene, path, v), path).sum() for path, v in values.items())
+
+    for slope in jax.tree.leaves(jax.jit(jax.grad(total))(values)):
+        assert_allclose(slope, 1.0, rtol=1e-14)
+
+
+def test_material_of_all_is_that_of_each():
+    world, state = paths.write(*FLAT, "restitution", 0.7)
+    assert_array_equal(world.bodies.restitution, 0.7)
+    assert_array_equal(world.statics.restitution, 0.7)
+    assert_array_equal(world.statics.friction, FLAT[0].statics.friction)
+
+
+def test_angle_is_another_name_for_q():
+    pair = paths.write(*FLAT, "wall.angle", -2.0)
+    assert_allclose(paths.read(*pair, "wall.q"), so2.exp(jnp.array([-2.0])), rtol=1e-15)
+    assert_allclose(paths.read(*FLAT, "ball.angle"), 0.4, rtol=1e-15)
+
+
+def test_values_may_carry_the_batch_of_their_leaf():
+    world = dr.replace(FLAT[0], bodies=dr.replace(FLAT[0].bodies, mass=jnp.ones((3, 4))))
+    one, each = (paths.write(world, FLAT[1], "ball.mass", value)[0] for value in (2.0, jnp.arange(4.0)))
+    assert_array_equal(one.bodies.mass[1], 2.0)
+    assert_array_equal(each.bodies.mass, [[1.0] * 4, range(4), [1.0] * 4])
+
+
+@pytest.mark.parametrize(
+    "path, near",
+    [
+        ("bal.mass", "'ball.mass'"),
+        ("ball.raduis", "'ball.shape.radius'"),
+        ("gravty", "'gravity'"),
+        ("rope.stifness", "'rope.stiffness'"),
+        ("ball.shape.half", "'wall.shape.half'"),
+        ("floor.mass", "'floor.x'|'ball.mass'"),
+        ("zzz", "there are air.angular"),
+    ],
+)
+def test_unknown_paths_list_the_nearest(path, near):
+    with pytest.raises(ValueError, match=f"no parameter '{path}' in this world: .*({near})"):
+        paths.read(*FLAT, path)
+
+
+@pytest.mark.parametrize(
+    "path, value, message",
+    [
+        ("gravity", 9.81, r"gravity was given the shape \(\): expected \(2,\)"),
+        ("ball.mass", (1.0, 2.0), r"ball.mass was given the shape \(2,\): expected \(\)"),
+        ("ball.angle", (1.0, 0.0), r"ball.angle was given the shape \(2,\): expected \(\)"),
+        ("restitution", (0.1, 0.2), r"restitution was given the shape \(2,\): expected \(3,\)"),
+        ("ball.mass", "heavy", "ball.mass is 'heavy': expected numbers"),
+    ],
+)
+def test_wrong_shapes(path, value, message):
+    with pytest.raises(ValueError, match=message):
+        paths.write(*FLAT, path, value)
+
+
+def test_units():
+    assert [paths.unit(p) for p in ("ball.mass", "ball.shape.radius", "air.linear", "restitution")] == [
+        "kg",
+        "m",
+        "N s/m",
+        "",
+    ]

@@ -1,0 +1,128 @@
+"""Contact(width > 0): Newton's law at a slightly larger distance, which a near miss feels too."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_form import PAIR, disc_and_plane, final, made, steps_near, two_boxes, two_discs
+from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+
+ROUNDING = 1e-12  # relative: a few hundred operations
+EXACT = 1e-9  # relative: rounding of a few hundred steps
+DISCS = PAIR | dict(ra=0.2, rb=0.2, xa=0.0, ya=0.0, xb=1.0, yb=0.1, vxa=2.0, vya=0.0, vxb=0.0, vyb=0.0, wa=1.0, wb=-2.0)
+BOXES = dict(
+    e=0.8, mu=0.0, xa=0.0, ya=0.0, xb=1.2, yb=0.1, vxa=2.0, vya=0.0, vxb=0.0, vyb=0.0, angle_a=0.2, angle_b=-0.5, wa=0.5, wb=1.0
+)  # fmt: skip
+PASSES = {
+    "discs": (two_discs, DISCS, dict(yb=0.45)),
+    "boxes": (two_boxes, BOXES, dict(yb=0.75)),
+}  # scene, hit, near miss
+
+
+def smoothed(world, width):
+    return dataclasses.replace(world, contact=dataclasses.replace(world.contact, width=jnp.asarray(width)))
+
+
+def run(make, parameters, width, t=1.0):
+    """World, states at 0 and t, and the Jacobian of the latter by all float leaves, outputs in front."""
+    world, start = made(make, parameters)
+    world = smoothed(world, width)
+    blocks, dt = steps_near(t, 60)
+    end, by_leaf = final(world, start, dt, blocks)
+    return world, start, ravel_pytree(start)[1](end), jax.vmap(ravel_pytree((world, start))[1])(by_leaf)
+
+
+def total(law, world, state):
+    return np.asarray(law(world.bodies, state).sum(0))
+
+
+@pytest.mark.parametrize("kind", PASSES)
+@pytest.mark.parametrize("width", [0.003, 0.03, 0.3])
+@pytest.mark.parametrize("path", ["hit", "near miss"])
+def test_momentum_is_kept_and_no_energy_made(kind, width, path):
+    make, hit, miss = PASSES[kind]
+    for material in (dict(e=1.0, mu=0.0), dict(e=1.0, mu=0.5), dict(e=0.3, mu=0.5)):
+        p = hit | material | (miss if path == "near miss" else {})
+        world, start, end, _ = run(make, p, width)
+        assert_allclose(total(dr.momentum, world, end), total(dr.momentum, world, start), atol=10 * ROUNDING)
+        ratio = total(dr.kinetic_energy, world, end) / total(dr.kinetic_energy, world, start)
+        assert ratio < 1 + ROUNDING
+        if material["e"] == 1.0 and material["mu"] == 0.0:
+            assert_allclose(ratio, 1.0, rtol=ROUNDING)
+
+
+def test_error_of_a_full_hit_falls_exponentially():
+    """Like width * exp(-depth / width), with the depth of the exact paths, (R^2 - offset^2) / 2 R."""
+    _, _, exact, _ = run(two_discs, DISCS, 0.0)
+    depth = (0.4**2 - 0.1**2) / 0.8
+    widths = depth / np.array([6.0, 8.0, 10.0, 12.0])
+    errors = [np.abs(run(two_discs, DISCS, width)[2].x - exact.x).max() for width in widths]
+    slope = np.polyfit(1 / widths, np.log(errors / widths), 1)[0]
+    assert_allclose(slope, -depth, rtol=1e-2)  # corrections of order exp(-6)
+    assert 1e-7 < errors[-1] < 1e-5 < errors[0] < 1e-2
+
+
+@pytest.mark.parametrize("kind", PASSES)
+def test_small_width_is_exact(kind):
+    make, hit, miss = PASSES[kind]
+    for p in (hit, hit | miss):
+        exact, exact_jac = run(make, p, 0.0)[2:]
+        narrow, narrow_jac = run(make, p, 1e-4)[2:]  # hits and misses by more than a hundred widths
+        jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), narrow, exact)
+        jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-6), narrow_jac[1], exact_jac[1])
+
+
+@pytest.mark.parametrize("kind", PASSES)
+def test_near_miss_moves_the_target(kind):
+    """The target moves, and aiming closer moves it more; at width 0 neither."""
+    make, hit, miss = PASSES[kind]
+    p = hit | miss | dict(mu=0.0)
+    target, y = 1, 1
+    row = 2 * target + y  # of the flat outputs: x[target, y]
+    _, start, end, jac = run(make, p, 0.05)
+    assert end.x[target, y] - start.x[target, y] > 0.01
+    assert jac[1].x[row, 0, y] > 0.01  # d(y of the target) / d(y of the shot), aimed from below
+    assert jac[1].v[row, 0, y] > 0.01
+    h = 1e-5
+    ahead, behind = (run(make, p | dict(vya=step), 0.05)[2].x[target, y] for step in (h, -h))
+    assert_allclose(jac[1].v[row, 0, y], (ahead - behind) / (2 * h), rtol=1e-5)  # h^2, and rounding / h
+    _, start, end, jac = run(make, p, 0.0)
+    free = start.x[target] + jnp.asarray([p["vxb"], p["vyb"]])
+    assert_allclose(end.x[target], free, atol=EXACT)
+    assert_allclose(jac[1].x[row, 0], 0.0, atol=0.0)
+    assert_allclose(jac[1].v[row, 0], 0.0, atol=0.0)
+
+
+def test_disc_that_turns_back_before_the_plane_feels_it():
+    """Thrown at a plane from which gravity pulls away, it comes within 2 cm; a speed too low by that misses."""
+    miss = dict(e=1.0, y=1.12, vy=-2.0, g=-2.0)  # gap_min = 1.02 - vy^2 / 2 g = 0.02 m; turns after 1 s
+    world, start, exact, jac = run(disc_and_plane, miss, 0.0, 1.5)
+    assert_allclose(exact.x[0, 1], 1.12 - 2.0 * 1.5 + 1.5**2, atol=EXACT)
+    _, _, end, smooth_jac = run(disc_and_plane, miss, 0.02, 1.5)
+    level = 0.02 * np.log1p(np.exp(1.0))  # width softplus(gap_min / width)
+    speed = np.sqrt(4.0 - 4.0 * (1.02 - level))
+    hit = (2.0 - speed) / 2.0
+    since = 1.5 - hit
+    assert_allclose(end.x[0, 1], 0.1 + level + speed * since + since**2, atol=EXACT)
+    assert_allclose(jac[0].bodies.restitution[1], 0.0, atol=0.0)
+    by_restitution = smooth_jac[0].bodies.restitution[1, 0] + smooth_jac[0].statics.restitution[1, 0]  # of both sides
+    assert_allclose(by_restitution, speed * since, rtol=EXACT)
+
+
+def test_annealing_compiles_once():
+    traces = []
+
+    @jax.jit
+    def end(world, state):
+        traces.append(None)
+        return dr.rollout(world, state, dt=1 / 60, steps=6).state.x[-1]
+
+    world, state = made(two_discs, DISCS | dict(xb=0.45))
+    ends = [end(smoothed(world, width), state) for width in (0.2, 0.05, 0.01, 0.0)]
+    assert len(traces) == 1
+    assert np.abs(ends[0] - ends[-1]).max() > 1e-3

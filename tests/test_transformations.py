@@ -1,0 +1,265 @@
+"""jit, vmap, batches, types, times and controls change no numbers; forces that vary are second order."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_form import BALL, CASES, bouncing, disc_and_plane, made, vector
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+from diffrigid.step import _rollout_jit, _step_jit
+
+ROUNDING = 1e-11  # absolute, of values about 1: the same operations in another order
+EXACT = 1e-9  # relative: rounding of a few hundred steps
+SINGLE = 1e-5  # relative: the rounding of float32, over 30 steps and a bounce
+STEPS = 30
+
+
+def assert_same(got, expected, atol):
+    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=atol, rtol=0), got, expected)
+
+
+# ---- transformations
+
+
+RUB = CASES["bounce that slides"].parameters
+
+
+def variants():
+    """Worlds and states that differ in everything, each bouncing within half a second."""
+    rng = np.random.default_rng(0)
+    return [made(disc_and_plane, {k: v * rng.uniform(0.8, 1.2) for k, v in RUB.items()}) for _ in range(4)]
+
+
+def rolled(world, state):
+    return dr.rollout(world, state, dt=1 / 60, steps=STEPS).state
+
+
+def test_jit_is_no_jit():
+    """One step with an impact in it, every operation on its own."""
+    world, state = made(disc_and_plane, RUB | dict(y=0.12, vy=-2.0))
+    compiled = dr.step(world, state, 1 / 60)
+    assert compiled.v[0, 1] > 1.0
+    assert_same(jax.jit(dr.step)(world, state, 1 / 60), compiled, 0.0)
+    with jax.disable_jit():
+        assert_same(dr.step(world, state, 1 / 60), compiled, ROUNDING)
+
+
+@pytest.mark.parametrize("axis", [0, -1], ids=["vmap", "trailing axis"])
+def test_batch_is_loop(axis):
+    """Worlds and states together; a trailing axis is what the library itself works on."""
+    alone = [rolled(*variant) for variant in variants()]
+    assert all(states.v[-1, 0, 1] > 0 for states in alone)  # all have bounced
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis), *variants())
+    together = jax.jit(jax.vmap(rolled))(*batch) if axis == 0 else rolled(*batch)
+    assert_same(together, jax.tree.map(lambda *leaves: jnp.stack(leaves, axis), *alone), ROUNDING)
+
+
+def test_batch_of_states_shares_a_world():
+    world, _ = variants()[0]
+    states = [state for _, state in variants()]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves, -1), *states)
+    alone = jax.tree.map(lambda *leaves: jnp.stack(leaves, -1), *[rolled(world, state) for state in states])
+    assert_same(rolled(world, batch), alone, ROUNDING)
+
+
+def test_other_values_do_not_compile_again():
+    """Values as users write them: Python integers and floats, NumPy numbers."""
+
+    def scene(radius, mass, gravity, e):
+        ball = dr.Body(dr.Disc(radius=radius), mass=mass, x=(0, 1))
+        floor = dr.Static(dr.HalfSpace(normal=(0, 1)))
+        return dr.scene({"ball": ball, "floor": floor}, gravity=gravity, restitution=e)
+
+    before = _rollout_jit._cache_size(), _step_jit._cache_size()
+    for values, dt in (((1, 2, (0, -10), 0), 0.01), ((0.5, np.float32(2.5), (0.1, -9.81), 0.7), np.float64(0.02))):
+        world, state = scene(*values)
+        dr.rollout(world, state, dt=dt, steps=3)
+        dr.rollout(dr.replace(world, contact=dr.Contact(width=dt)), state, dt=dt, steps=3)
+        dr.step(world, state, dt)
+    assert (_rollout_jit._cache_size(), _step_jit._cache_size()) == (before[0] + 1, before[1] + 1)
+
+
+def test_float32_stays_float32():
+    world, state = variants()[0]
+    single = rolled(*jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (world, state)))
+    assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {jnp.dtype(jnp.float32)}
+    assert_same(single, jax.tree.map(np.float32, rolled(world, state)), 30 * SINGLE)  # angles of some ten radians
+
+
+def test_rollout_is_steps():
+    world, state = variants()[0]
+    states = rolled(world, state)
+    for k in range(STEPS):
+        state = dr.step(world, state, 1 / 60)
+        assert_same(jax.tree.map(lambda leaf, k=k: leaf[k + 1], states), state, ROUNDING)
+
+
+# ---- times
+
+
+def test_rollout_lands_on_given_times_and_is_differentiable_in_them():
+    times = jnp.asarray([0.1, 0.15, 0.3, 0.417, 0.5])  # the state is that at 0.1 s; the ball bounces 0.23 s later
+    p = BALL | dict(vy=0.0)
+    world, state = made(disc_and_plane, p)
+
+    def heights(times):
+        return dr.rollout(world, state, times=times, dt=1 / 60).state.x[:, 0, 1]
+
+    def exact(t):
+        return jnp.stack([0.3 - 9.81 * t * t / 2, bouncing(1)(t, **p).x[0, 1]])
+
+    since = times - times[0]
+    hit = jnp.sqrt(2 * 0.2 / 9.81)
+    after = (since > hit).astype(int)
+    value, speed = jax.vmap(exact)(since), jax.vmap(jax.jacfwd(exact))(since)
+    value, speed = (jnp.take_along_axis(a, after[:, None], 1)[:, 0] for a in (value, speed))
+    trajectory = dr.rollout(world, state, times=times, dt=1 / 60)
+    assert_allclose(trajectory.t, times, rtol=0)
+    assert_allclose(heights(times), value, atol=EXACT)
+    by_time = np.diag(speed)
+    by_time[:, 0] -= speed  # the state is given at the first time: all later motion moves with it
+    assert_allclose(jax.jacfwd(heights)(times), by_time, atol=EXACT)
+    with pytest.raises(ValueError, match="increase"):
+        heights(times[::-1])
+
+
+def test_controls_hold_through_the_substeps_of_an_interval():
+    """A torque tau + u_k in interval k: the spin is the sum of tau T_k / I; the angle that of a constant acceleration."""
+    inertia, tau = 0.4, 0.3
+    body = dr.Body(None, mass=1.0, inertia=inertia, x=(0.0, 0.0), w=0.5)
+    world, state = dr.scene({"wheel": body}, forces=[dr.Torque(body="wheel", tau=tau, control="motor")])
+    times = jnp.asarray([0.0, 0.1, 0.25, 0.3])
+    u = jnp.asarray([[1.0], [-2.0], [0.5]])
+
+    def spins(u):
+        states = dr.rollout(world, state, times=times, dt=0.04, controls={"motor": u}).state
+        return states.w[:, 0, 0], jnp.arctan2(states.q[:, 0, 1], states.q[:, 0, 0])
+
+    T, a = np.diff(times), (tau + np.asarray(u[:, 0])) / inertia
+    w = 0.5 + np.concatenate([[0.0], np.cumsum(a * T)])
+    angle = np.concatenate([[0.0], np.cumsum(w[:-1] * T + a * T**2 / 2)])
+    assert_allclose(spins(u)[0], w, rtol=EXACT)
+    assert_allclose(spins(u)[1], angle, atol=EXACT)
+    by_control = jax.jacrev(lambda u: spins(u)[1][-1])(u)
+    assert_allclose(by_control[:, 0], T * (T / 2 + (times[-1] - times[1:])) / inertia, rtol=EXACT)
+
+
+# ---- forces
+
+
+def order(error_at, steps):
+    """Observed order of an error that is a function of the number of steps, and the error at twice as many."""
+    coarse, fine = error_at(steps), error_at(2 * steps)
+    return np.log2(coarse / fine), fine
+
+
+def assert_second_order(error_at, steps, finest):
+    observed, fine = order(error_at, steps)
+    assert 1.85 < observed < 2.15, f"order {observed:.2f}, error {fine:.1e}"
+    assert fine < finest
+
+
+def last(scene, t, steps):
+    world, state = scene
+    return jax.tree.map(lambda rows: rows[-1], dr.rollout(world, state, dt=t / steps, steps=steps).state)
+
+
+def test_drag_is_exponential_decay():
+    m, c, I, k, t = 1.5, np.array([0.9, 0.3]), 0.2, 0.25, 1.0
+    body = dr.Body(None, mass=m, inertia=I, x=(0.0, 0.0), v=(2.0, -1.0), w=3.0)
+    scene = dr.scene({"body": body}, forces=[dr.Drag(linear=c, angular=k)])
+    v, w = np.array([2.0, -1.0]) * np.exp(-c * t / m), 3.0 * np.exp(-k * t / I)
+    x, angle = m / c * (np.array([2.0, -1.0]) - v), I / k * (3.0 - w)
+
+    def error(steps):
+        s = last(scene, t, steps)
+        turn = jnp.arctan2(s.q[0, 1], s.q[0, 0]) - angle
+        turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
+        errors = jnp.concatenate([s.x[0] - x, s.v[0] - v, s.w[0] - w, turn[None]])
+        return np.abs(errors)
+
+    coarse, fine = error(30), error(60)
+    assert (np.abs(np.log2(coarse / fine) - 2.0) < 0.15).all()  # every component
+    assert fine.max() < 1e-3
+
+
+def test_spring_and_damper_oscillate():
+    """Along x about the rest length: a damped harmonic oscillator, l - length = A exp(-gamma t) cos(omega t)."""
+    m, k, c, length, t = 0.8, 30.0, 0.6, 1.0, 1.3
+    gamma = c / (2 * m)
+    omega = np.sqrt(k / m - gamma**2)
+    body = dr.Body(None, mass=m, inertia=1.0, x=(1.4, 0.5), v=(-0.4 * gamma, 0.0))
+    spring = dr.SpringDamper(a="body", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.5), stiffness=k, damping=c, length=length)
+    scene = dr.scene({"body": body}, forces=[spring])
+    x = length + 0.4 * np.exp(-gamma * t) * np.cos(omega * t)
+
+    def error(steps):
+        s = last(scene, t, steps)
+        assert_allclose(s.x[0, 1], 0.5, atol=ROUNDING)
+        return abs(float(s.x[0, 0]) - x)
+
+    assert_second_order(error, 60, 3e-3)
+
+
+def test_spring_between_bodies_keeps_momentum():
+    """Anchored off their centres, in space: forces opposite, torques about one point opposite."""
+    rng = np.random.default_rng(0)
+    bodies = {
+        name: dr.Body(None, mass=m, inertia=np.array([0.2, 0.3, 0.4]), x=rng.normal(size=3), v=rng.normal(size=3), w=rng.normal(size=3))
+        for name, m in (("a", 1.0), ("b", 2.5))
+    }  # fmt: skip
+    ends = dict(anchor_a=rng.normal(size=3) / 3, anchor_b=rng.normal(size=3) / 3)
+    world, state = dr.scene(
+        bodies, forces=[dr.SpringDamper(a="a", b="b", stiffness=20.0, damping=0.4, length=0.5, **ends)]
+    )
+
+    @jax.jit
+    def drift(dt):
+        states = dr.rollout(world, state, dt=dt, steps=40).state
+
+        def sums(state):
+            return dr.momentum(world.bodies, state).sum(0), dr.angular_momentum(world.bodies, state).sum(0)
+
+        p, L = jax.vmap(sums)(states)
+        return jnp.abs(p[-1] - p[0]).max(), jnp.abs(L[-1] - L[0]).max(), jnp.abs(states.v[-1] - states.v[0]).max()
+
+    (p, L, pulled), (_, L_fine, _) = drift(0.01), drift(0.005)
+    assert pulled > 0.5
+    assert p < ROUNDING
+    assert L < 1e-3 and L_fine < 0.3 * L  # second order or better over the same number of steps, half the time
+
+
+def test_force_at_a_point_pushes_and_turns():
+    """A constant force at a point of the body is a pendulum in the field of that force: I angle'' = -l F sin(angle)."""
+    m, I, F, l, angle, t = 2.0, 0.3, 1.5, 0.4, 1.0, 1.5
+    body = dr.Body(None, mass=m, inertia=I, x=(0.2, 0.1), v=(0.0, 0.3), angle=angle)
+    scene = dr.scene({"body": body}, forces=[dr.Force(body="body", F=(F, 0.0), point=(l, 0.0))])
+    y, h = np.array([angle, 0.0]), t / 1000
+
+    def rate(y):
+        return np.array([y[1], -l * F / I * np.sin(y[0])])
+
+    for _ in range(1000):  # Runge-Kutta, error about 1e-11
+        k1 = rate(y)
+        k2 = rate(y + h / 2 * k1)
+        k3 = rate(y + h / 2 * k2)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(y + h * k3))
+
+    def error(steps):
+        s = last(scene, t, steps)
+        assert_allclose(s.x[0], [0.2 + F / m * t * t / 2, 0.1 + 0.3 * t], atol=ROUNDING)  # the force does not turn
+        return abs(float(jnp.arctan2(s.q[0, 1], s.q[0, 0])) - y[0])
+
+    assert_second_order(error, 60, 1e-3)
+
+
+def test_torque_in_space_turns_about_its_axis():
+    """About a principal axis, in world axes: exact."""
+    body = dr.Body(None, mass=1.0, inertia=(0.2, 0.3, 0.4), x=jnp.zeros(3), w=(0.0, 0.0, 1.0))
+    scene = dr.scene({"body": body}, forces=[dr.Torque(body="body", tau=(0.0, 0.0, 0.6))])
+    s, t = last(scene, 1.0, 40), 1.0
+    angle = 1.0 * t + 0.6 / 0.4 * t * t / 2
+    assert_allclose(s.w[0], [0.0, 0.0, 1.0 + 0.6 / 0.4 * t], atol=EXACT)
+    assert_allclose(s.q[0], vector(np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)), atol=EXACT)
