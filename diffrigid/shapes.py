@@ -7,6 +7,7 @@ Letters: D space (2 or 3), V vertices, F faces. The float leaves are differentia
 topology of a hull (`faces`, `edges`) is static.
 """
 
+import functools
 import itertools
 import math
 
@@ -115,11 +116,16 @@ def vertices(shape: Shape, dim: int) -> Array:
             return jnp.stack([x] + [jnp.zeros_like(x)] * (dim - 1), axis=1)
         case Box():
             half = floats(shape.half)
-            signs = jnp.asarray(_SQUARE if dim == 2 else _CUBE, half.dtype)
-            return signs.reshape(signs.shape + (1,) * (half.ndim - 1)) * half[None]
+            return _box_signs(dim, half.ndim - 1, half.dtype) * half[None]
         case Polygon() | Hull():
             return floats(shape.vertices)
     raise ValueError(f"{type(shape).__name__} has no vertices; it needs its own colliders.")
+
+
+@functools.cache
+def _box_signs(dim: int, batch_rank: int, dtype) -> np.ndarray:
+    signs = np.array(_SQUARE if dim == 2 else _CUBE, dtype)
+    return signs.reshape(signs.shape + (1,) * batch_rank)
 
 
 def radius(shape: Shape) -> Array:

@@ -5,8 +5,7 @@ inertia is a number, (*batch). Vectors (2, *batch). World and body rotation rate
 """
 
 import jax.numpy as jnp
-import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from diffrigid.numerics import cos_sin, dot
 
@@ -15,8 +14,8 @@ D, A, Q = 2, 1, 2  # components of a vector, of an angular velocity, of an orien
 
 def perp(r: Array) -> Array:
     """r turned by a quarter, (-y, x). By reversal, because XLA does not vectorise loops that stack components."""
-    sign = np.array([-1.0, 1.0], r.dtype).reshape(2, *[1] * (r.ndim - 1))
-    return jnp.multiply(sign, r[::-1])
+    sign = 2.0 * lax.broadcasted_iota(r.dtype, r.shape, 0) - 1.0
+    return sign * r[::-1]
 
 
 def rotate(q: Array, r: Array) -> Array:

@@ -186,7 +186,7 @@ def fenced(world: World):
 
         return lax.cond(dt < jnp.inf, jax.checkpoint(again, prevent_cse=False), lambda state: state, state)
 
-    return one_step
+    return jax.checkpoint(one_step, prevent_cse=False)
 
 
 def _block_length(state: State, steps: int) -> int:

@@ -92,7 +92,7 @@ def test_bad_records(change, message):
     ("free", "message"),
     [
         ({}, "nothing to fit"),
-        ({"d0.mas": dr.positive()}, "did you mean d0.mass"),
+        ({"d0.mas": dr.positive()}, "did you mean 'd0.mass'"),
         ({"d0.mass": (0, 1)}, "expected interval"),
     ],
 )

@@ -12,10 +12,9 @@ and not rounding. `slack` (*batch) [m] is how near counts as at a face, an edge 
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from diffrigid.numerics import dot, norm, normalise, unit_vector
+from diffrigid.numerics import dot, norm, normalise, rows, unit_vector
 from diffrigid.shapes import Box, Capsule, Disc, Hull, Polygon, Sphere, radius, vertices
 from diffrigid.so3 import cross
 
@@ -76,7 +75,7 @@ def polygon_distance(shape: Polygon, p: Array, inward: Array, slack: Array) -> t
 
 def hull_distance(shape: Hull, p: Array, inward: Array, slack: Array) -> tuple[Array, Array]:
     """Distance from a convex hull: inside, the least deep face; outside, the closest of its triangles."""
-    a, b, c = (jnp.asarray(shape.vertices)[np.array(index)] for index in zip(*(shape.faces or ()), strict=True))
+    a, b, c = (rows(shape.vertices, index) for index in zip(*(shape.faces or ()), strict=True))
     outward = jax.vmap(normalise)(jax.vmap(cross)(b - a, c - a))
     height = jax.vmap(dot)(outward, p[None] - a)
     facing = jax.vmap(dot, in_axes=(0, None))(outward, inward)

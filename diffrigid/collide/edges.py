@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from diffrigid import so3
 from diffrigid.collide.contacts import Contacts
-from diffrigid.numerics import dot, normalise, safe_divide, unit_vector
+from diffrigid.numerics import dot, normalise, rows, safe_divide, unit_vector
 from diffrigid.shapes import Capsule, edge_apexes, edges, radius
 
 FAR = 1e6  # [m] gap of a crossing that does not exist
@@ -43,9 +42,9 @@ def crossing_edges(
     edges_a, edges_b = _edges(a, corners_a), _edges(b, corners_b)
     size_a, size_b = edges_a.start.shape[1], edges_b.start.shape[1]
     # The barrier keeps XLA from placing the edges anew for each of their pairs.
-    rows, columns, margin = lax.optimization_barrier(lax.stop_gradient((edges_a, edges_b, slack)))
-    rows, columns = Edges(*(leaf[:, :, None] for leaf in rows)), Edges(*(leaf[:, None] for leaf in columns))
-    order = _order(_crossing(rows, columns, margin[None, None]), separated, margin[None, None])
+    down, across, margin = lax.optimization_barrier(lax.stop_gradient((edges_a, edges_b, slack)))
+    down, across = Edges(*(leaf[:, :, None] for leaf in down)), Edges(*(leaf[:, None] for leaf in across))
+    order = _order(_crossing(down, across, margin[None, None]), separated, margin[None, None])
     order = jnp.moveaxis(order.reshape(size_a * size_b, *slack.shape), 0, -1)
     count = (CROSSINGS, 2, 1)[isinstance(a, Capsule) + isinstance(b, Capsule)]
     nearest, index = (jnp.moveaxis(leaf, -1, 0) for leaf in lax.top_k(-order, count))
@@ -66,8 +65,8 @@ def crossing_edges(
 
 
 def _edges(shape, corners: Array) -> Edges:
-    ends, beside = np.array(edges(shape, 3)), np.array(edge_apexes(shape, 3))
-    start, end, left, right = (jnp.swapaxes(corners[i], 0, 1) for i in (*ends.T, *beside.T))
+    columns = *zip(*edges(shape, 3), strict=True), *zip(*edge_apexes(shape, 3), strict=True)
+    start, end, left, right = (jnp.swapaxes(rows(corners, index), 0, 1) for index in columns)
     return Edges(start, end - start, left - start, right - start)
 
 

@@ -25,7 +25,7 @@ from diffrigid.contact.resting import Mobility, Strikes, solve_impulses, velocit
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
 from diffrigid.contact.strikes import find_strikes, materials, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
-from diffrigid.numerics import dot
+from diffrigid.numerics import dot, rows
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
@@ -131,8 +131,8 @@ def _is_next(strikes: Strikes, fast: Array, moving: int, dt: Array) -> Array:
     s = lax.stop_gradient(strikes.s)
     tie = jnp.sqrt(jnp.finfo(s.dtype).eps) * dt[None]
     times = jnp.where(fast, s, jnp.inf)
-    rows = jnp.concatenate([times, times, jnp.full_like(times[:1], jnp.inf)])
-    first = rows[body_sides(strikes.a, strikes.b, moving)].min(1)
+    padded = jnp.concatenate([times, times, jnp.full_like(times[:1], jnp.inf)])
+    first = rows(padded, body_sides(strikes.a, strikes.b, moving)).min(1)
     earliest = jnp.minimum(at_colliders(first, strikes.a, jnp.inf), at_colliders(first, strikes.b, jnp.inf))
     return jnp.abs(s - earliest) <= tie
 

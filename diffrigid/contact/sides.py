@@ -1,16 +1,16 @@
 """The two colliders of a pair on their paths, and sums over the pairs that each body is in."""
 
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.distance import reach
 from diffrigid.flight import Flight, angular_velocity, orientation, position, velocity
-from diffrigid.numerics import dot, norm
+from diffrigid.numerics import dot, norm, rows
 from diffrigid.pytree import array, pytree
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
@@ -45,15 +45,15 @@ def sides_of(world: Any, pairs: PairGroup, flight: Flight, since: Array) -> tupl
     """Both sides of P pairs of one kind, every array with a leading axis P."""
     moving = flight.t0.shape[0]
 
-    def rows(tree, index):
-        return jax.tree.map(lambda leaf: leaf[np.array(index)], tree)
+    def chosen(tree, index):
+        return jax.tree.map(lambda leaf: rows(leaf, index), tree)
 
     def side(colliders, group, shape_rows):
-        shape, offset = rows((world.shapes[group], world.offsets[group]), shape_rows)
+        shape, offset = chosen((world.shapes[group], world.offsets[group]), shape_rows)
         offset = None if offset is None else offset.r
         if min(colliders) < moving:
-            return Side(flight=rows(flight, colliders), since=rows(since, colliders), shape=shape, offset=offset)
-        x, q = rows((world.statics.x, world.statics.q), np.array(colliders) - moving)
+            return Side(flight=chosen(flight, colliders), since=chosen(since, colliders), shape=shape, offset=offset)
+        x, q = chosen((world.statics.x, world.statics.q), tuple(i - moving for i in colliders))
         return Side(flight=None, shape=shape, offset=offset, x=x, q=q)
 
     return side(pairs.a, pairs.shape_a, pairs.row_a), side(pairs.b, pairs.shape_b, pairs.row_b)
@@ -130,24 +130,24 @@ def side_sum(values_a: Array, values_b: Array, a: tuple[int, ...], b: tuple[int,
     scatter is a serial one.
     """
     values_a, values_b = lax.optimization_barrier((values_a, values_b))
-    rows = jnp.concatenate([values_a, values_b, jnp.zeros_like(values_a[:1])])
-    return rows[body_sides(a, b, moving)].sum(1)
+    padded = jnp.concatenate([values_a, values_b, jnp.zeros_like(values_a[:1])])
+    return rows(padded, body_sides(a, b, moving)).sum(1)
 
 
-def body_sides(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> np.ndarray:
+@functools.cache
+def body_sides(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> tuple[tuple[int, ...], ...]:
     """For each moving body, the rows of [contacts as a, contacts as b, nothing] that touch it, (N, most)."""
     sides: list[list[int]] = [[] for _ in range(moving)]
     for row, body in enumerate(a + b):
         if body < moving:
             sides[body].append(row)
     most = max(map(len, sides), default=0)
-    return np.array([rows + [2 * len(a)] * (most - len(rows)) for rows in sides], dtype=np.int32)
+    return tuple(tuple(rows + [2 * len(a)] * (most - len(rows))) for rows in sides)
 
 
 def at_colliders(values: Array, colliders: tuple[int, ...], fill: float) -> Array:
     """Values of the moving bodies (N, ...) at each contact's collider, (C, ...); `fill` for statics."""
-    index = np.array(colliders)
-    still = index.max() + 1 - values.shape[0]
+    still = max(colliders) + 1 - values.shape[0]
     if still > 0:
         values = jnp.concatenate([values, jnp.full((still, *values.shape[1:]), fill, values.dtype)])
-    return values[index]
+    return rows(values, colliders)

@@ -13,7 +13,7 @@ from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
-from diffrigid.numerics import dot, norm
+from diffrigid.numerics import dot, norm, rows
 from diffrigid.pytree import replace
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
@@ -100,14 +100,16 @@ def materials(world: Any) -> tuple[Array, Array]:
     The mean over the two bodies; a value that a body was given outweighs one that it has by default.
     """
     index = ends(world)
-    a, b = np.array(index["a"]), np.array(index["b"])
+    a, b = index["a"], index["b"]
 
     def combine(name, given):
         moving, still = getattr(world.bodies, name), getattr(world.statics, name)
         batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
         values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
-        given = np.array(given, values.dtype)
-        share = (0.5 * (1.0 + given[a] - given[b])).reshape(-1, *[1] * len(batch))
-        return share * values[a] + (1.0 - share) * values[b]
+        a_counts = [given[j] <= given[i] for i, j in zip(a, b, strict=True)]
+        b_counts = [given[i] <= given[j] for i, j in zip(a, b, strict=True)]
+        from_a = tuple(i if counts else j for i, j, counts in zip(a, b, a_counts, strict=True))
+        from_b = tuple(j if counts else i for i, j, counts in zip(a, b, b_counts, strict=True))
+        return 0.5 * (rows(values, from_a) + rows(values, from_b))
 
     return combine("restitution", world.own_restitution), combine("friction", world.own_friction)
