@@ -7,6 +7,8 @@ Vectors carry their components on the leading axis, `(D, *batch)`.
 """
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,17 +39,57 @@ def rows(values: Array, index: tuple) -> Array:
     """
     first = index[0]
     if isinstance(first, tuple):
-        return values.at[_constant(index)].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
     if index == (first,) * len(index):
         return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))
     if index == tuple(range(first, first + len(index))):
         return values[first : first + len(index)]
-    return values.at[_constant(index)].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def packed_map(fn: Callable[[Array], Array], tree: Any, batch_rank: int) -> Any:
+    """The tree with fn(leaf) for every leaf (M, ..., *batch), in one call for all leaves of one batch shape.
+
+    `fn` acts on the leading axis of (M, F, *batch) arrays and may change its length.
+    """
+    leaves, treedef = jax.tree.flatten(tree)
+    batches = [leaf.shape[leaf.ndim - batch_rank :] for leaf in leaves]
+    mapped: list[Any] = [None] * len(leaves)
+    for batch in set(batches):
+        members = [k for k in range(len(leaves)) if batches[k] == batch]
+        columns = [leaves[k].reshape(leaves[k].shape[0], -1, *batch) for k in members]
+        whole, start = fn(jnp.concatenate(columns, axis=1)), 0
+        for k, column in zip(members, columns, strict=True):
+            part, start = whole[:, start : start + column.shape[1]], start + column.shape[1]
+            mapped[k] = part.reshape(part.shape[0], *leaves[k].shape[1 : leaves[k].ndim - batch_rank], *part.shape[2:])
+    return treedef.unflatten(mapped)
+
+
+def fence(live: Array, tree: Any) -> Any:
+    """The tree itself, but computed before it is used: XLA does not fuse across a branch.
+
+    Where several results depend on one, XLA on a CPU computes it again inside each of them, and again for each
+    component that is picked from it: in a chain of products of vectors this grows exponentially. An
+    `optimization_barrier` is removed before fusion. So the fence is a choice that is always the same.
+
+    Args:
+        live: bool, True, but not known when compiling.
+    """
+    leaves, treedef = jax.tree.flatten(tree)
+    alike: dict[Any, list[int]] = {}
+    for k, leaf in enumerate(leaves):
+        alike.setdefault((leaf.shape, leaf.dtype), []).append(k)
+    other = list(range(len(leaves)))
+    for group in alike.values():
+        for k, next_k in zip(group, group[1:] + group[:1], strict=True):
+            other[k] = next_k
+    return treedef.unflatten(lax.cond(live, lambda x: x, lambda x: [x[k] for k in other], leaves))
 
 
 @functools.cache
-def _constant(index: tuple) -> np.ndarray:
-    return np.array(index, np.int32)
+def constant(table: tuple, dtype: str) -> np.ndarray:
+    """A tuple, or a tuple of tuples, as an array that is made once; see `rows`."""
+    return np.array(table, dtype)
 
 
 def safe_sqrt(x: Array) -> Array:

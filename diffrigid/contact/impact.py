@@ -27,7 +27,7 @@ from diffrigid.contact.sides import (
     relative_acceleration,
 )
 from diffrigid.numerics import dot, implicit_root, norm, safe_divide, safe_sqrt, softplus
-from diffrigid.shapes import Disc, HalfSpace, Sphere
+from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere
 from diffrigid.state import rotations
 
 ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
@@ -36,13 +36,13 @@ NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over t
 
 
 def find_impact(
-    a: Side, b: Side, t1: Array, width: Array, straight: bool, rest_speed: Array, at_end: Array
+    a: Side, b: Side, t1: Array, width: Array | None, straight: bool, rest_speed: Array, at_end: Array
 ) -> tuple[Array, Array, Array, Array]:
     """First impact of one pair before t1, or the end of the step itself.
 
     Args:
         t1: (*batch) [s] end of the step.
-        width: (*batch) [m] of the smooth distance; 0 is exact.
+        width: (*batch) [m] of the smooth distance; 0 is exact. None: exact, known when tracing.
         straight: all bodies have the same acceleration, so relative paths are straight lines.
         rest_speed: (*batch) [m/s] slower impacts do not move their time with the parameters.
         at_end: bool; True: do not look for an impact, s is t1.
@@ -53,7 +53,7 @@ def find_impact(
 
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
     """
-    s0, level, found = _approach(a, b, t1, width, straight)
+    s0, level, found, _ = approach(a, b, t1, width, straight)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     slack = jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.minimum(reach_of(a), reach_of(b))
@@ -66,14 +66,19 @@ def find_impact(
     return s, hit | at_end, level, slack
 
 
-def _approach(a: Side, b: Side, t1, width, straight) -> tuple[Array, Array, Array]:
-    """Time of the impact (no gradient), level of the gap at which it happens, and whether there is one."""
-    is_round = isinstance(a.shape, Disc | Sphere)
-    if is_round and isinstance(b.shape, Disc | Sphere) and straight:
-        return _approach_straight(a, b, width)
-    if is_round and isinstance(b.shape, HalfSpace):
-        return _approach_parabola(a, b, width)
-    return _approach_search(a, b, t1, width)
+def approach(a: Side, b: Side, t1: Array, width: Array | None, straight: bool):
+    """Time of the impact (no gradient), level of the gap at which it happens, whether there is one, closing speed.
+
+    The speed is None where the time has no closed form.
+    """
+    if not closed_form(a.shape, b.shape, straight):
+        return *_approach_search(a, b, t1, width), None
+    return _approach_parabola(a, b, width) if isinstance(b.shape, HalfSpace) else _approach_straight(a, b, width)
+
+
+def closed_form(a: Shape, b: Shape, straight: bool) -> bool:
+    """Whether the impact time of two shapes has a closed form, where all bodies fall alike (`straight`) or not."""
+    return isinstance(a, Disc | Sphere) and (isinstance(b, HalfSpace) or (isinstance(b, Disc | Sphere) and straight))
 
 
 def _earliest(a: Side, b: Side) -> tuple[Array, Array]:
@@ -84,7 +89,7 @@ def _earliest(a: Side, b: Side) -> tuple[Array, Array]:
     return jnp.maximum(a.flight.t0, b.flight.t0), jnp.maximum(a.since, b.since)
 
 
-def _approach_straight(a: Side, b: Side, width: Array) -> tuple[Array, Array, Array]:
+def _approach_straight(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:
     """Two round shapes whose relative path is a line: |P + W s| = R + level.
 
     With D = (P.W)^2 - W^2 (P^2 - R^2), smooth: D -> eps softplus(D / eps), eps = 2 R W^2 width, and the
@@ -97,18 +102,24 @@ def _approach_straight(a: Side, b: Side, width: Array) -> tuple[Array, Array, Ar
     W2, closing, excess = dot(W, W), -dot(P, W), dot(P, P) - R * R
     D_exact = closing * closing - W2 * excess
 
-    def smooth(D):
-        return softplus(D, 2.0 * R * W2 * width)
-
-    D = lax.cond(jnp.any(width > 0), smooth, lambda D: jnp.maximum(D, 0.0), D_exact)
-    raised = safe_divide(D - D_exact, W2)
-    level = safe_sqrt(R * R + raised) - R
-    s = start + safe_divide(excess - raised, closing + safe_sqrt(D))
+    if width is None:
+        D, raised, level = D_exact, 0.0, jnp.zeros_like(D_exact)
+    else:
+        D = _if_smooth(width, lambda D: softplus(D, 2.0 * R * W2 * width), lambda D: jnp.maximum(D, 0.0), D_exact)
+        raised = safe_divide(D - D_exact, W2)
+        level = safe_sqrt(R * R + raised) - R
+    root = safe_sqrt(D)
+    s = start + safe_divide(excess - raised, closing + root)
     found = (closing > 0) & (D > 0)
-    return jnp.where(s < bound, start, s), level, found
+    return jnp.where(s < bound, start, s), level, found, root / (R + level)
 
 
-def _approach_parabola(a: Side, b: Side, width: Array) -> tuple[Array, Array, Array]:
+def _if_smooth(width: Array | None, smooth, exact, *args: Array) -> Array:
+    """smooth(*args) if any width is positive, else exact(*args)."""
+    return exact(*args) if width is None else lax.cond(jnp.any(width > 0), smooth, exact, *args)
+
+
+def _approach_parabola(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:
     """A round shape and a half-space at rest: gap(s) = gap + v s + acc s^2 / 2, exactly."""
     so, (start, bound) = rotations(a.flight.dim), _earliest(a, b)
     normal = so.rotate(b.q, b.shape.normal)
@@ -121,7 +132,7 @@ def _approach_parabola(a: Side, b: Side, width: Array) -> tuple[Array, Array, Ar
     def smooth(gap_min):
         return jnp.where(turns_back, softplus(gap_min, width), 0.0)
 
-    level = lax.cond(jnp.any(width > 0), smooth, jnp.zeros_like, gap_min)
+    level = _if_smooth(width, smooth, jnp.zeros_like, gap_min)
     height = gap - level
     root = safe_sqrt(v * v - 2.0 * acc * height)
     later = safe_divide(v + root, -acc)  # on the way up: the way down
@@ -130,19 +141,17 @@ def _approach_parabola(a: Side, b: Side, width: Array) -> tuple[Array, Array, Ar
     # Below the surface and sinking, with no crossing in the past: the impact is now.
     sunk = (height < 0) & (v * v < 2.0 * acc * height)
     found = jnp.where(turns_back, (v < 0) & (root > 0), (v < 0) | (acc < 0)) | sunk
-    return jnp.where(sunk | (s < bound), start, s), level, found
+    return jnp.where(sunk | (s < bound), start, s), level, found, root
 
 
-def _approach_search(a: Side, b: Side, t1: Array, width: Array) -> tuple[Array, Array, Array]:
+def _approach_search(a: Side, b: Side, t1: Array, width: Array | None) -> tuple[Array, Array, Array]:
     """Any two shapes: conservative advancement to the neighbourhood, then the parabola of the next contact."""
     start, bound = _earliest(a, b)
     frozen_a, frozen_b = lax.stop_gradient((a, b))
     size = jnp.minimum(reach_of(a), reach_of(b))
     near = _advance(frozen_a, frozen_b, start, t1, NEAR * size)
-    level = lax.cond(
-        jnp.any(width > 0),
-        lambda: _closest_level(a, b, near, t1 - start, width),
-        lambda: jnp.zeros_like(near),
+    level = _if_smooth(
+        width, lambda near: _closest_level(a, b, near, t1 - start, width), lambda near: jnp.zeros_like(near), near
     )
     s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size)
     return jnp.where(s < bound, start, s), level, found

@@ -21,9 +21,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.contact.isolated import grid_of, is_crowded, meet, partners
 from diffrigid.contact.resting import Mobility, Strikes, solve_impulses, velocity_changes
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
-from diffrigid.contact.strikes import find_strikes, materials, may_meet
+from diffrigid.contact.strikes import ends, find_strikes, material, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.numerics import dot, rows
 from diffrigid.pytree import Leaf, array, pytree, replace, static
@@ -60,11 +61,12 @@ class Contact:
         t0 = jnp.zeros_like(state.x[:, 0])
         if not world.pairs:
             return state_at(launch(state, t0), dt)
+        start = Anchors(state=state, t0=t0, since=t0 - dt[None])
+        if is_crowded(world):  # some pair is always near, and times are found fast
+            return self._passes(world, start, launch, dt)
         flight = launch(state, t0)
         return lax.cond(
-            may_meet(world, flight, dt),
-            lambda: self._passes(world, Anchors(state=state, t0=t0, since=t0 - dt[None]), launch, dt),
-            lambda: state_at(flight, dt),
+            may_meet(world, flight, dt), lambda: self._passes(world, start, launch, dt), lambda: state_at(flight, dt)
         )
 
     def _passes(self, world: Any, start: "Anchors", launch: Callable, dt: Array) -> State:
@@ -75,9 +77,25 @@ class Contact:
         def one_pass(anchors, resting, phase):
             return _pass(world, anchors, launch, resting, dt, phase)
 
+        grids = tuple(grid_of(pairs) for pairs in world.pairs) if is_crowded(world) else ()
+
+        @jax.checkpoint
+        def meet_partners(anchors, nows):
+            return _meet_partners(world, grids, anchors, launch, nows, dt)
+
+        def isolated_or_any(anchors, resting, phase):
+            flight = lax.stop_gradient(launch(anchors.state, anchors.t0))
+            nows, isolated, found = partners(world, grids, flight, anchors.since, dt)
+
+            def isolated_pass():
+                return lax.cond(found, meet_partners, lambda anchors, _: anchors, anchors, nows), resting, found
+
+            return lax.cond(isolated & (phase == IMPACT), isolated_pass, lambda: one_pass(anchors, resting, phase))
+
         def maybe(carry, phase):
             needed = jnp.where(phase == IMPACT, carry[2], jnp.any(carry[1]))
-            return lax.cond(needed, lambda c: one_pass(*c[:2], phase), lambda c: c, carry), None
+            some_pass = isolated_or_any if grids else one_pass
+            return lax.cond(needed, lambda c: some_pass(*c[:2], phase), lambda c: c, carry), None
 
         phases = jnp.array([IMPACT] * self.sweeps + [HOLD, PUSH])
         (end, _, _), _ = lax.scan(maybe, (start, resting, jnp.asarray(True)), phases)
@@ -98,7 +116,8 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     impact, push = phase == IMPACT, phase == PUSH
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
-    restitution, friction = materials(world)
+    index = ends(world)
+    restitution, friction = (material(world, name, **index) for name in ("restitution", "friction"))
     u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
     slow = u <= world.contact.rest_speed[None]
     now = strikes.active & _is_next(strikes, strikes.active & ~slow, len(world.names), dt)
@@ -146,19 +165,46 @@ def _apply(anchors: Anchors, flight: Flight, strikes: Strikes, target, mu, kick:
         kick: 1, or 0 for a displacement that leaves velocities as they are.
         lever: (N, *batch) [s] displacement per change of velocity.
     """
-    so, moving, active = rotations(flight.dim), flight.t0.shape[0], strikes.active.astype(kick.dtype)
-    count = side_sum(active, active, strikes.a, strikes.b, moving)
-    total = side_sum(active * strikes.s, active * strikes.s, strikes.a, strikes.b, moving)
+    moving, active = flight.t0.shape[0], strikes.active.astype(kick.dtype)
+    both = jnp.stack([active, active * strikes.s], axis=1)
+    count, total = jnp.moveaxis(side_sum(both, both, strikes.a, strikes.b, moving), 1, 0)
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
+    q, mobility = _posed(flight, t)
+    P = solve_impulses(strikes, target, mu, mobility, count)
+    return _anchored(anchors, flight, t, q, count > 0, velocity_changes(strikes, P, mobility), kick, lever)
+
+
+def _meet_partners(world: Any, grids: tuple, anchors: Anchors, launch: Callable, nows, dt: Array) -> Anchors:
+    """The anchors after impacts of bodies that have one partner each."""
+    so, flight = rotations(world.dim), launch(anchors.state, anchors.t0)
+    blows = meet(world, grids, nows, flight, anchors.since, dt)
+    hit = blows.count > 0
+    t = jnp.where(hit, blows.s, flight.t0)
+    q, mobility = _posed(flight, t)
+    changes = mobility.inverse_mass[:, None] * blows.P, jax.vmap(so.apply)(mobility.inverse_inertia, blows.turn)
+    return _anchored(anchors, flight, t, q, hit, changes, jnp.ones((), dt.dtype), jnp.zeros_like(t))
+
+
+def _posed(flight: Flight, t: Array) -> tuple[Array, Mobility]:
+    """Orientations of all bodies, each at its own time t (N, *batch), and their mobility there."""
     q = jax.vmap(orientation)(flight, t)
-    inverse = jax.vmap(so.world_inverse)(flight.inverse_inertia, q)
-    mobility = Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse)
-    P = solve_impulses(strikes, target, mu, mobility)
+    inverse = jax.vmap(rotations(flight.dim).world_inverse)(flight.inverse_inertia, q)
+    return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse)
+
+
+def _anchored(anchors: Anchors, flight: Flight, t, q, hit, changes, kick, lever) -> Anchors:
+    """Every body anchored anew at its time t, after changes (dv, dw) of its velocities.
+
+    Args:
+        q: orientations at t.
+        hit: (N, *batch) bool: its path holds from t on only.
+    """
+    so = rotations(flight.dim)
 
     def struck(f, t, q, dv, dw, lever):
         w = so.unspin(f.inverse_inertia, q, angular_momentum(f, t))
         x = position(f, t) + lever[None] * dv
         return State(x=x, q=so.turn_by(lever[None] * dw, q), v=velocity(f, t) + kick * dv, w=w + kick * dw)
 
-    state = jax.vmap(struck)(flight, t, q, *velocity_changes(strikes, P, mobility), lever)
-    return Anchors(state=state, t0=t, since=jnp.where(count > 0, t, anchors.since))
+    state = jax.vmap(struck)(flight, t, q, *changes, lever)
+    return Anchors(state=state, t0=t, since=jnp.where(hit, t, anchors.since))

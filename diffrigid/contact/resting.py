@@ -52,21 +52,25 @@ class Mobility:
 def velocity_changes(arms: Strikes | Arms, P: Array, mobility: Mobility) -> tuple[Array, Array]:
     """Changes of v (N, D) [m/s] and w (N, A) [rad/s] of the moving bodies by the impulses P on side a."""
     so, moving = rotations(P.shape[1]), mobility.inverse_mass.shape[0]
-    turn_a, turn_b = jax.vmap(so.moment)(arms.arm_a, P), jax.vmap(so.moment)(arms.arm_b, -P)
-    linear = side_sum(P, -P, arms.a, arms.b, moving)
-    angular = side_sum(turn_a, turn_b, arms.a, arms.b, moving)
+    on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a, P)], axis=1)
+    on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b, -P)], axis=1)
+    total = side_sum(on_a, on_b, arms.a, arms.b, moving)
+    linear, angular = total[:, : so.D], total[:, so.D :]
     return mobility.inverse_mass[:, None] * linear, jax.vmap(so.apply)(mobility.inverse_inertia, angular)
 
 
 def relative_changes(arms: Strikes | Arms, dv: Array, dw: Array) -> Array:
     """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
-    cross = jax.vmap(rotations(dv.shape[1]).cross)
-    at_a = at_colliders(dv, arms.a, 0.0) + cross(at_colliders(dw, arms.a, 0.0), arms.arm_a)
-    at_b = at_colliders(dv, arms.b, 0.0) + cross(at_colliders(dw, arms.b, 0.0), arms.arm_b)
-    return at_a - at_b
+    so, both = rotations(dv.shape[1]), jnp.concatenate([dv, dw], axis=1)
+    at_a, at_b = at_colliders(both, arms.a, 0.0), at_colliders(both, arms.b, 0.0)
+
+    def point_velocity(at, arm):
+        return at[: so.D] + so.cross(at[so.D :], arm)
+
+    return jax.vmap(point_velocity)(at_a, arms.arm_a) - jax.vmap(point_velocity)(at_b, arms.arm_b)
 
 
-def solve_impulses(strikes: Strikes, target: Array, mu: Array, mobility: Mobility) -> Array:
+def solve_impulses(strikes: Strikes, target: Array, mu: Array, mobility: Mobility, crowd: Array) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
     Each contact solves its own law against a share of the mass of its bodies (mass splitting; Tonge et al.
@@ -77,9 +81,9 @@ def solve_impulses(strikes: Strikes, target: Array, mu: Array, mobility: Mobilit
     Args:
         target: (C, *batch) [m/s] normal velocity after the impulse.
         mu: (C, *batch) [-].
+        crowd: (N, *batch) number of active contacts of each body.
     """
     one = strikes.active.astype(strikes.s.dtype)
-    crowd = side_sum(one, one, strikes.a, strikes.b, mobility.inverse_mass.shape[0])
     split = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
     split = lax.stop_gradient(jnp.maximum(split, 1.0))
     arms = Arms(arm_a=strikes.arm_a, arm_b=strikes.arm_b, a=strikes.a, b=strikes.b)

@@ -43,20 +43,23 @@ class Placed:
 
 def sides_of(world: Any, pairs: PairGroup, flight: Flight, since: Array) -> tuple[Side, Side]:
     """Both sides of P pairs of one kind, every array with a leading axis P."""
+    a = side_of(world, flight, since, pairs.shape_a, pairs.row_a, pairs.a)
+    return a, side_of(world, flight, since, pairs.shape_b, pairs.row_b, pairs.b)
+
+
+def side_of(world: Any, flight: Flight, since: Array, kind: int, shape_rows: tuple, colliders: tuple) -> Side:
+    """Shapes `shape_rows` of world.shapes[kind], on colliders that all move or all stand still."""
     moving = flight.t0.shape[0]
 
     def chosen(tree, index):
         return jax.tree.map(lambda leaf: rows(leaf, index), tree)
 
-    def side(colliders, group, shape_rows):
-        shape, offset = chosen((world.shapes[group], world.offsets[group]), shape_rows)
-        offset = None if offset is None else offset.r
-        if min(colliders) < moving:
-            return Side(flight=chosen(flight, colliders), since=chosen(since, colliders), shape=shape, offset=offset)
-        x, q = chosen((world.statics.x, world.statics.q), tuple(i - moving for i in colliders))
-        return Side(flight=None, shape=shape, offset=offset, x=x, q=q)
-
-    return side(pairs.a, pairs.shape_a, pairs.row_a), side(pairs.b, pairs.shape_b, pairs.row_b)
+    shape, offset = chosen((world.shapes[kind], world.offsets[kind]), shape_rows)
+    offset = None if offset is None else offset.r
+    if min(colliders) < moving:
+        return Side(flight=chosen(flight, colliders), since=chosen(since, colliders), shape=shape, offset=offset)
+    x, q = chosen((world.statics.x, world.statics.q), tuple(i - moving for i in colliders))
+    return Side(flight=None, shape=shape, offset=offset, x=x, q=q)
 
 
 def place(side: Side, s: Array) -> Placed:

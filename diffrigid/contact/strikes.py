@@ -24,27 +24,9 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
 
     Active are those that touch then; of the next impact, only if it happens before the end.
     """
-    straight, contact = is_uniform(world.forces), world.contact
-
-    def one(a: Side, b: Side) -> Strikes:
-        s, hit, level, slack = find_impact(a, b, dt, contact.width, straight, contact.rest_speed, at_end)
-        at_a, at_b = place(a, s), place(b, s)
-        contacts = contacts_of(a, at_a, b, at_b)
-        active = (contacts.gap <= (level + slack)[None]) & hit[None]
-        pulled = -_acceleration(at_a, at_b)
-
-        def each(normal, point, gap):
-            return Strikes(
-                active=gap < 0, s=s, gap=gap, normal=normal, arm_a=point - at_a.x, arm_b=point - at_b.x,
-                K=effective_matrix(at_a, at_b, point), v_rel=relative_velocity(at_a, at_b, point),
-                push=dot(normal, pulled),
-            )  # fmt: skip
-
-        return replace(jax.vmap(each)(contacts.normal, contacts.point, contacts.gap), active=active)
-
-    parts = []
+    width, parts = world.contact.width, []
     for pairs in world.pairs:
-        part = jax.vmap(one)(*sides_of(world, pairs, flight, since))
+        part = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, at_end, width))(*sides_of(world, pairs, flight, since))
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if len(parts) > 1:
         # The barrier keeps XLA from fusing all that made the parts into the copy, a loop with a branch in it.
@@ -53,6 +35,25 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     else:
         strikes = parts[0]
     return replace(strikes, **ends(world))
+
+
+def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array | bool, width: Array | None) -> Strikes:
+    """The contacts of one pair, (K, ...); see `find_strikes`."""
+    straight, rest_speed = is_uniform(world.forces), world.contact.rest_speed
+    s, hit, level, slack = find_impact(a, b, dt, width, straight, rest_speed, at_end)
+    at_a, at_b = place(a, s), place(b, s)
+    contacts = contacts_of(a, at_a, b, at_b)
+    active = (contacts.gap <= (level + slack)[None]) & hit[None]
+    pulled = -_acceleration(at_a, at_b)
+
+    def each(normal, point, gap):
+        return Strikes(
+            active=gap < 0, s=s, gap=gap, normal=normal, arm_a=point - at_a.x, arm_b=point - at_b.x,
+            K=effective_matrix(at_a, at_b, point), v_rel=relative_velocity(at_a, at_b, point),
+            push=dot(normal, pulled),
+        )  # fmt: skip
+
+    return replace(jax.vmap(each)(contacts.normal, contacts.point, contacts.gap), active=active)
 
 
 def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
@@ -94,22 +95,14 @@ def _acceleration(at_a, at_b) -> Array:
     return -at_b.a if at_a.v is None else at_a.a - at_b.a
 
 
-def materials(world: Any) -> tuple[Array, Array]:
-    """Restitution and friction of every contact of the list, (C, *batch).
+def material(world: Any, name: str, a: tuple[int, ...], b: tuple[int, ...]) -> Array:
+    """Restitution or friction (`name`) between colliders a and b, (C, *batch).
 
-    The mean over the two bodies; a value that a body was given outweighs one that it has by default.
+    The mean over the two; a value that a body was given outweighs one that it has by default.
     """
-    index = ends(world)
-    a, b = index["a"], index["b"]
-
-    def combine(name, given):
-        moving, still = getattr(world.bodies, name), getattr(world.statics, name)
-        batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
-        values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
-        a_counts = [given[j] <= given[i] for i, j in zip(a, b, strict=True)]
-        b_counts = [given[i] <= given[j] for i, j in zip(a, b, strict=True)]
-        from_a = tuple(i if counts else j for i, j, counts in zip(a, b, a_counts, strict=True))
-        from_b = tuple(j if counts else i for i, j, counts in zip(a, b, b_counts, strict=True))
-        return 0.5 * (rows(values, from_a) + rows(values, from_b))
-
-    return combine("restitution", world.own_restitution), combine("friction", world.own_friction)
+    given, moving, still = getattr(world, f"own_{name}"), getattr(world.bodies, name), getattr(world.statics, name)
+    batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
+    values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
+    first = tuple(i if given[j] <= given[i] else j for i, j in zip(a, b, strict=True))
+    second = tuple(j if given[i] <= given[j] else i for i, j in zip(a, b, strict=True))
+    return 0.5 * (rows(values, first) + rows(values, second))
