@@ -79,11 +79,12 @@ def fence(live: Array, tree: Any) -> Any:
     alike: dict[Any, list[int]] = {}
     for k, leaf in enumerate(leaves):
         alike.setdefault((leaf.shape, leaf.dtype), []).append(k)
-    other = list(range(len(leaves)))
-    for group in alike.values():
-        for k, next_k in zip(group, group[1:] + group[:1], strict=True):
-            other[k] = next_k
-    return treedef.unflatten(lax.cond(live, lambda x: x, lambda x: [x[k] for k in other], leaves))
+    following = {k: group[(i + 1) % len(group)] for group in alike.values() for i, k in enumerate(group)}
+
+    def mixed_up(leaves):  # were a leaf the same in both branches, it would bypass the choice
+        return [leaves[following[k]] if following[k] != k else leaf[::-1] for k, leaf in enumerate(leaves)]
+
+    return treedef.unflatten(lax.cond(live, lambda leaves: leaves, mixed_up, leaves))
 
 
 @functools.cache

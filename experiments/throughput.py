@@ -133,7 +133,7 @@ def build_diffrigid(scene):
     discs = {f"b{i}": dr.Body(dr.Disc(radius=scene.radius), mass=1.0, x=x, v=v) for i, (x, v) in start}
     walls = {f"wall{i}": dr.Static(dr.HalfSpace(normal=n, offset=d)) for i, (n, d) in enumerate(scene.walls)}
     constants = {"gravity": (0.0, -scene.gravity), "restitution": scene.restitution, "friction": 0.0}
-    return dr.scene(discs | walls, **constants)
+    return dr.scene(discs | walls, contact=dr.Contact(sweeps=1), **constants)
 
 
 def diffrigid_rate(scenes):

@@ -5,12 +5,12 @@ the contact point,
 
     n . v+ = target,  the normal law:    target = -e n . v-  (Newton)
     P = gamma n + kappa Q,               gamma = (target - n . v-) / (n . K n),  1 / (n . K n): effective mass
-    K Q = -(slip after gamma n)          Q stops the slip and leaves the normal law as it is
-    |P_t| <= mu P_n                      kappa = 1 sticks; else the largest kappa in the cone slides
-    kinetic energy does not rise         a bound on kappa that acts rarely (Kane's paradox)
+    sticks:  K Q = -(slip after gamma n)                            if then |P_t| <= mu P_n
+    slides:  P = gamma_s (n - mu slip / |slip|) = gamma n + Q       else; gamma_s such that the normal law holds
+    kinetic energy does not rise         a bound kappa <= 1 that acts rarely (Kane's paradox)
 
 For a round body this is the textbook law: |gamma_t| <= mu gamma, stick if the impulse that stops the slip
-fits. Where a corner couples the directions, Newton's law still holds exactly.
+fits, else slide against it. Where a corner couples the directions, Newton's law still holds exactly.
 Source: Chatterjee & Ruina, J. Applied Mechanics 65 (1998) 939, for the splitting; Kane & Levinson 1985.
 """
 
@@ -20,10 +20,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.contact.sides import Placed
-from diffrigid.numerics import dot, norm, safe_divide, safe_sqrt
+from diffrigid.numerics import dot, norm, normalise, safe_divide, safe_sqrt
 from diffrigid.so2 import perp
 from diffrigid.so3 import cross
 from diffrigid.state import rotations
+
+JAMMED = 1e-3  # [-] of the normal mobility: where sliding would close the contact as fast as its normal impulse opens it
 
 
 def effective_matrix(at_a: Placed, at_b: Placed, point: Array) -> Array:
@@ -61,28 +63,29 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
     Differentiable except at the switches: separating to closing, stick to slip.
     """
     Kn, v_n = times(K, n), dot(n, v)
-    gamma = jnp.maximum(safe_divide(target - v_n, dot(n, Kn)), 0.0)
+    mass_n = safe_divide(1.0, dot(n, Kn))
+    gamma = jnp.maximum(mass_n * (target - v_n), 0.0)
     after = v + gamma[None] * Kn
     slip = after - dot(n, after)[None] * n
-    Q = -inverse_times(K, slip)
-    Q_n = dot(n, Q)
-    Q_t = norm(Q - Q_n[None] * n)
-    kappa = jnp.minimum(_within_cone(gamma, Q_n, Q_t, mu), _within_energy(gamma, Q_n, v_n, target, dot(Q, slip)))
+    Q = friction_impulse(K, n, Kn, gamma, slip, mu)
+    kappa = _within_energy(0.5 * gamma * (v_n + target), dot(Q, after), dot(Q, times(K, Q)))
     return gamma[None] * n + kappa[None] * Q
 
 
-def _within_cone(gamma, Q_n, Q_t, mu):
-    """Largest kappa <= 1 with kappa Q_t <= mu (gamma + kappa Q_n)."""
-    excess = Q_t - mu * Q_n
-    outside = excess > mu * gamma
-    return jnp.where(outside, mu * gamma / jnp.where(outside, excess, 1.0), 1.0)
+def friction_impulse(K: Array, n: Array, Kn: Array, gamma: Array, slip: Array, mu: Array) -> Array:
+    """What friction adds to the impulse gamma n, (D, *batch) [N s]. It leaves the normal velocity: n . K Q = 0."""
+    stop = -inverse_times(K, slip)
+    stop_n = dot(n, stop)
+    # sliding: P = gamma_s (n - mu along), with gamma_s such that the normal law holds
+    along = normalise(slip)
+    share = 1.0 - mu * safe_divide(dot(Kn, along), dot(n, Kn))
+    sticks = (norm(stop - stop_n[None] * n) <= mu * (gamma + stop_n)) | (share < JAMMED)
+    slide = (gamma / jnp.where(sticks, 1.0, share))[None] * (n - mu[None] * along) - gamma[None] * n
+    return jnp.where(sticks[None], stop, slide)
 
 
-def _within_energy(gamma, Q_n, v_n, target, Q_slip):
-    """Largest kappa <= 1 whose change of kinetic energy, T0 + b kappa + c kappa^2 / 2, is not positive."""
-    T0 = 0.5 * gamma * (v_n + target)
-    c = -Q_slip
-    b = Q_n * target - c
+def _within_energy(T0: Array, b: Array, c: Array) -> Array:
+    """Largest kappa <= 1 for which the kinetic energy does not rise: T0 + b kappa + c kappa^2 / 2 <= 0."""
     gains = T0 + b + 0.5 * c > 0
     root = (safe_sqrt(b * b - 2.0 * c * jnp.minimum(T0, 0.0)) - b) / jnp.where(gains, c, 1.0)
     return jnp.where(gains, jnp.clip(root, 0.0, 1.0), 1.0)

@@ -24,7 +24,7 @@ from jax import Array, lax
 from diffrigid.contact.isolated import grid_of, is_crowded, meet, partners
 from diffrigid.contact.resting import Mobility, Strikes, solve_impulses, velocity_changes
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
-from diffrigid.contact.strikes import ends, find_strikes, material, may_meet
+from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.numerics import dot, rows
 from diffrigid.pytree import Leaf, array, pytree, replace, static
@@ -74,7 +74,8 @@ class Contact:
         resting = jnp.zeros((contacts, *start.t0.shape[1:]), bool)
 
         @jax.checkpoint  # what a pass computes is cheaper to compute again than to save, and to compile
-        def one_pass(anchors, resting, phase):
+        def one_pass(anchors, resting, found, rests, phase):
+            del found, rests
             return _pass(world, anchors, launch, resting, dt, phase)
 
         grids = tuple(grid_of(pairs) for pairs in world.pairs) if is_crowded(world) else ()
@@ -83,22 +84,27 @@ class Contact:
         def meet_partners(anchors, nows):
             return _meet_partners(world, grids, anchors, launch, nows, dt)
 
-        def isolated_or_any(anchors, resting, phase):
+        def isolated_or_any(anchors, resting, found, rests, phase):
             flight = lax.stop_gradient(launch(anchors.state, anchors.t0))
             nows, isolated, found = partners(world, grids, flight, anchors.since, dt)
 
             def isolated_pass():
-                return lax.cond(found, meet_partners, lambda anchors, _: anchors, anchors, nows), resting, found
+                met = lax.cond(found, meet_partners, lambda anchors, _: anchors, anchors, nows)
+                return met, resting, found, rests
 
-            return lax.cond(isolated & (phase == IMPACT), isolated_pass, lambda: one_pass(anchors, resting, phase))
+            def any_pass():
+                return one_pass(anchors, resting, found, rests, phase)
+
+            return lax.cond(isolated & (phase == IMPACT), isolated_pass, any_pass)
 
         def maybe(carry, phase):
-            needed = jnp.where(phase == IMPACT, carry[2], jnp.any(carry[1]))
+            *_, found, rests = carry
+            needed = jnp.where(phase == IMPACT, found, rests)
             some_pass = isolated_or_any if grids else one_pass
-            return lax.cond(needed, lambda c: some_pass(*c[:2], phase), lambda c: c, carry), None
+            return lax.cond(needed, lambda c: some_pass(*c, phase), lambda c: c, carry), None
 
         phases = jnp.array([IMPACT] * self.sweeps + [HOLD, PUSH])
-        (end, _, _), _ = lax.scan(maybe, (start, resting, jnp.asarray(True)), phases)
+        (end, *_), _ = lax.scan(maybe, (start, resting, jnp.asarray(True), jnp.asarray(False)), phases)
         return state_at(launch(end.state, end.t0), dt)
 
 
@@ -112,12 +118,12 @@ class Anchors:
 
 
 def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Array, phase: Array):
-    """One pass: the anchors after it, the contacts that rest, and whether there was an impact."""
+    """One pass: the anchors after it, the contacts that rest, whether there was an impact, whether any rests."""
     impact, push = phase == IMPACT, phase == PUSH
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
     index = ends(world)
-    restitution, friction = (material(world, name, **index) for name in ("restitution", "friction"))
+    restitution, friction = (mixed(*(material(world, name, index[side]) for side in "ab")) for name in MATERIALS)
     u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
     slow = u <= world.contact.rest_speed[None]
     now = strikes.active & _is_next(strikes, strikes.active & ~slow, len(world.names), dt)
@@ -136,7 +142,7 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
         return _apply(anchors, flight, strikes, target, jnp.where(push, 0.0, friction), kick, lever)
 
     any_now = jnp.any(now)
-    return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now
+    return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, jnp.any(resting)
 
 
 def _falls_along(flight: Flight, world: Any, u: Array, dt: Array) -> Array:

@@ -13,8 +13,8 @@ from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
-from diffrigid.numerics import dot, norm, rows
-from diffrigid.pytree import replace
+from diffrigid.numerics import constant, dot, fence, norm, rows
+from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
@@ -27,10 +27,9 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     width, parts = world.contact.width, []
     for pairs in world.pairs:
         part = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, at_end, width))(*sides_of(world, pairs, flight, since))
+        part = fence(jnp.any(dt > 0), part)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if len(parts) > 1:
-        # The barrier keeps XLA from fusing all that made the parts into the copy, a loop with a branch in it.
-        parts = lax.optimization_barrier(parts)
         strikes = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
     else:
         strikes = parts[0]
@@ -95,14 +94,27 @@ def _acceleration(at_a, at_b) -> Array:
     return -at_b.a if at_a.v is None else at_a.a - at_b.a
 
 
-def material(world: Any, name: str, a: tuple[int, ...], b: tuple[int, ...]) -> Array:
-    """Restitution or friction (`name`) between colliders a and b, (C, *batch).
+MATERIALS = ("restitution", "friction")
 
-    The mean over the two; a value that a body was given outweighs one that it has by default.
-    """
-    given, moving, still = getattr(world, f"own_{name}"), getattr(world.bodies, name), getattr(world.statics, name)
+
+@pytree
+class Material:
+    """A coefficient of M colliders."""
+
+    value: Array = array("M")  # (M, *batch) [-]
+    given: Array = array("M")  # (M, *batch) 1 if it was given to the collider itself, 0 if it is the scene's
+
+
+def material(world: Any, name: str, colliders: tuple[int, ...]) -> Material:
+    """Restitution or friction (`name`) of colliders."""
+    moving, still = getattr(world.bodies, name), getattr(world.statics, name)
     batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
     values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
-    first = tuple(i if given[j] <= given[i] else j for i, j in zip(a, b, strict=True))
-    second = tuple(j if given[i] <= given[j] else i for i, j in zip(a, b, strict=True))
-    return 0.5 * (rows(values, first) + rows(values, second))
+    own = getattr(world, f"own_{name}")
+    given = constant(tuple(float(own[i]) for i in colliders), str(values.dtype))
+    return Material(value=rows(values, colliders), given=lax.expand_dims(given, range(1, values.ndim)))
+
+
+def mixed(a: Material, b: Material) -> Array:
+    """Coefficient of two colliders: the mean; but what was given to a collider outweighs what was not."""
+    return 0.5 * ((1.0 + a.given - b.given) * a.value + (1.0 + b.given - a.given) * b.value)
