@@ -25,7 +25,9 @@ from diffrigid.so2 import perp
 from diffrigid.so3 import cross
 from diffrigid.state import rotations
 
-JAMMED = 1e-3  # [-] of the normal mobility: where sliding would close the contact as fast as its normal impulse opens it
+JAMMED = (
+    1e-3  # [-] of the normal mobility: where sliding would close the contact as fast as its normal impulse opens it
+)
 
 
 def effective_matrix(at_a: Placed, at_b: Placed, point: Array) -> Array:

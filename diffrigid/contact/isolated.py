@@ -146,9 +146,12 @@ def _sides(world: Any, grid: Grid, flight: Flight, since: Array) -> tuple[Side, 
 
 def _pick(live: Array, now: Array, sides: Any) -> Any:
     """Of B sides, for each of A rows that one with which it is now (A, B, *batch); the first where there is none."""
-    none = 1.0 - _fold(jnp.add, now, 1)
-    weights = jnp.concatenate([(now[:, 0] + none)[:, None], now[:, 1:]], axis=1)
-    return packed_map(lambda values: fence(live, _weighted_sum(weights, values, 1)), sides, now.ndim - 2)
+    none = (1.0 - _fold(jnp.add, now, 1))[:, None]
+
+    def pick(values):
+        return fence(live, none * values[None, 0] + _weighted_sum(now, values, 1))
+
+    return packed_map(pick, sides, now.ndim - 2)
 
 
 def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:

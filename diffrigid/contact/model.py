@@ -62,14 +62,13 @@ class Contact:
         if not world.pairs:
             return state_at(launch(state, t0), dt)
         start = Anchors(state=state, t0=t0, since=t0 - dt[None])
-        if is_crowded(world):  # some pair is always near, and times are found fast
-            return self._passes(world, start, launch, dt)
-        flight = launch(state, t0)
-        return lax.cond(
-            may_meet(world, flight, dt), lambda: self._passes(world, start, launch, dt), lambda: state_at(flight, dt)
-        )
+        # In a crowd some pair is always near, and times are found fast.
+        near = jnp.asarray(True) if is_crowded(world) else may_meet(world, launch(state, t0), dt)
+        end = self._passes(world, start, launch, dt, near)
+        return state_at(launch(end.state, end.t0), dt)
 
-    def _passes(self, world: Any, start: "Anchors", launch: Callable, dt: Array) -> State:
+    def _passes(self, world: Any, start: "Anchors", launch: Callable, dt: Array, near: Array) -> "Anchors":
+        """The anchors after all passes; there are none unless some pair is `near`, a bool."""
         contacts = sum(len(pairs.a) * pairs.count for pairs in world.pairs)
         resting = jnp.zeros((contacts, *start.t0.shape[1:]), bool)
 
@@ -104,8 +103,8 @@ class Contact:
             return lax.cond(needed, lambda c: some_pass(*c, phase), lambda c: c, carry), None
 
         phases = jnp.array([IMPACT] * self.sweeps + [HOLD, PUSH])
-        (end, *_), _ = lax.scan(maybe, (start, resting, jnp.asarray(True), jnp.asarray(False)), phases)
-        return state_at(launch(end.state, end.t0), dt)
+        (end, *_), _ = lax.scan(maybe, (start, resting, near, jnp.asarray(False)), phases)
+        return end
 
 
 @pytree

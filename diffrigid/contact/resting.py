@@ -165,7 +165,9 @@ def _repeat(one_round, first: Array, shared: Array) -> Array:
     def busy(carry):
         # The change is measured here, on stored arrays: beside the round, XLA would compute the law again for it.
         count, x, _, change = carry
-        return shared & (count < ROUNDS) & (jnp.max(jnp.abs(change)) > 4.0 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x)))
+        return (
+            shared & (count < ROUNDS) & (jnp.max(jnp.abs(change)) > 4.0 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x)))
+        )
 
     def again(carry):
         count, x, before, change_before = carry

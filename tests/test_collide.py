@@ -1,0 +1,114 @@
+"""Every pair of the table against separating axes in NumPy: gap, normal, point, and the derivative of the gap."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+from diffrigid.collide import COLLIDERS, CONVEX_2D, CONVEX_3D
+from diffrigid.overlap import place, separation
+from diffrigid.shapes import with_topology
+from diffrigid.state import rotations
+
+POSES = 24
+ROUNDING = 1e-9  # [m], of shapes about 1 m
+
+SHAPES = {
+    2: {
+        dr.Disc: dr.Disc(radius=0.6),
+        dr.Capsule: dr.Capsule(radius=0.2, half_length=0.7),
+        dr.Box: dr.Box(half=(0.8, 0.3)),
+        dr.Polygon: dr.Polygon(vertices=((-0.5, -0.4), (0.7, -0.6), (0.9, 0.2), (0.1, 0.8), (-0.6, 0.3))),
+    },
+    3: {
+        dr.Sphere: dr.Sphere(radius=0.6),
+        dr.Capsule: dr.Capsule(radius=0.2, half_length=0.7),
+        dr.Box: dr.Box(half=(0.8, 0.3, 0.5)),
+        dr.Hull: dr.Hull(vertices=((-0.6, -0.5, -0.4), (0.8, -0.3, -0.3), (-0.1, 0.9, -0.4), (0.1, 0.1, 0.8))),
+    },
+}
+PAIRS = [(2, a, b) for a, b in itertools.combinations_with_replacement(CONVEX_2D, 2)]
+PAIRS += [(3, a, b) for a, b in itertools.combinations_with_replacement(CONVEX_3D, 2)]
+PAIRS += [(dim, a, dr.HalfSpace) for dim, kinds in ((2, CONVEX_2D), (3, CONVEX_3D)) for a in kinds]
+
+
+def shape_of(dim, kind):
+    shape = SHAPES[dim].get(kind, dr.HalfSpace(normal=(0.6, 0.8, 0.0)[:dim], offset=0.2))
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, float), with_topology(shape), is_leaf=lambda x: isinstance(x, tuple)
+    )
+
+
+def poses(dim, kind_a, kind_b):
+    """Poses of both, (POSES, ...), and their signed distances: from 2 mm deep to far."""
+    rng = np.random.default_rng(dim)
+    a, b = shape_of(dim, kind_a), shape_of(dim, kind_b)
+    q = rng.normal(size=(2, POSES, 2 if dim == 2 else 4))
+    q /= np.linalg.norm(q, axis=2, keepdims=True)
+    x = rng.normal(size=(POSES, dim))
+    towards = np.array([so_rotate(dim, qb, b.normal) for qb in q[1]]) if kind_b is dr.HalfSpace else x
+    towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    wanted, found = rng.choice([-0.002, 0.01, 0.3], POSES), np.zeros(POSES)
+    for k in range(POSES):
+        x[k] = 3.0 * towards[k]
+        for _ in range(60):  # the distance along a line out of a convex body rises no faster than the way
+            found[k] = distance(dim, a, x[k], q[0, k], b, q[1, k])
+            x[k] += (wanted[k] - found[k]) * towards[k]
+        found[k] = distance(dim, a, x[k], q[0, k], b, q[1, k])
+    return (a, x, q[0]), (b, np.zeros((POSES, dim)), q[1]), found
+
+
+def so_rotate(dim, q, r):
+    return np.asarray(rotations(dim).rotate(jnp.asarray(q), jnp.asarray(r)))
+
+
+def distance(dim, a, x_a, q_a, b, q_b):
+    origin = np.zeros(dim)
+    return separation(place(a, x_a, q_a, origin), place(b, np.zeros(dim), q_b, origin))
+
+
+@pytest.mark.parametrize(("dim", "kind_a", "kind_b"), PAIRS, ids=lambda p: getattr(p, "__name__", f"{p}D"))
+def test_pair(dim, kind_a, kind_b):
+    (a, x_a, q_a), (b, x_b, q_b), expected = poses(dim, kind_a, kind_b)
+
+    @jax.jit
+    def closest(x_a, q_a, x_b, q_b):
+        """The least gap of one pose, its normal and point, and how the gap moves with x_a."""
+
+        def least(x_a):
+            contacts = COLLIDERS[kind_a, kind_b](a, x_a, q_a, b, x_b, q_b)
+            k = jnp.argmin(contacts.gap)
+            return contacts.gap[k], (contacts.normal[k], contacts.point[k])
+
+        (gap, rest), slope = jax.value_and_grad(least, has_aux=True)(x_a)
+        return gap, *rest, slope
+
+    gap, normal, point, slope = map(np.asarray, jax.vmap(closest)(x_a, q_a, x_b, q_b))
+    assert_allclose(gap, expected, atol=ROUNDING)
+    assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=ROUNDING)
+    assert_allclose(slope, normal, atol=1e-7)  # the distance of convex bodies moves along their normal
+    for k in range(POSES):  # moved back along the normal they touch, and at the point
+        touching = distance(dim, a, x_a[k] - gap[k] * normal[k], q_a[k], b, q_b[k])
+        assert_allclose(touching, 0.0, atol=ROUNDING if expected[k] > 0 else 1e-5)
+        if expected[k] < 0:
+            continue  # near an edge the point inside may be closer to another face
+        speck = place(dr.Disc(radius=0.0) if dim == 2 else dr.Sphere(radius=0.0), point[k], q_a[k], np.zeros(dim))
+        assert_allclose(separation(speck, place(b, x_b[k], q_b[k], np.zeros(dim))), 0.5 * gap[k], atol=1e-7)
+
+
+@pytest.mark.parametrize(("dim", "kind"), [(dim, kind) for dim in SHAPES for kind in SHAPES[dim]])
+def test_concentric_and_touching_poses_are_finite(dim, kind):
+    """At the same place, and exactly face to face: values and derivatives are finite."""
+    shape, q = shape_of(dim, kind), jnp.eye(2 if dim == 2 else 4)[0]
+
+    def gaps(x):
+        contacts = COLLIDERS[kind, kind](shape, x, q, shape, jnp.zeros(dim), q)
+        return jnp.concatenate([contacts.gap, contacts.normal.ravel(), contacts.point.ravel()])
+
+    both = jax.jit(lambda x: (gaps(x), jax.jacrev(gaps)(x)))
+    for x in (jnp.zeros(dim), 1.2 * jnp.eye(dim)[0], 1.6 * jnp.eye(dim)[0], 0.6 * jnp.eye(dim)[1]):
+        assert all(np.isfinite(leaf).all() for leaf in both(x))
