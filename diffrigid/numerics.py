@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array, lax
 
 
+@jax.custom_jvp
 def dot(a: Array, b: Array) -> Array:
     """Inner product over the leading axis, (D, *batch), (D, *batch) -> (*batch)."""
     # Component by component: XLA does not vectorise a loop with a reduction of length 2 or 3 inside.
@@ -23,6 +24,13 @@ def dot(a: Array, b: Array) -> Array:
     for i in range(1, a.shape[0]):
         total = total + a[i] * b[i]
     return total
+
+
+@dot.defjvp
+def _dot_jvp(primals, tangents):
+    # As a reduction, whose transpose is a broadcast; that of picking a component is a padded sum.
+    (a, b), (da, db) = primals, tangents
+    return dot(a, b), (a * db + da * b).sum(0)
 
 
 def unit_vector(like: Array, axis: int) -> Array:

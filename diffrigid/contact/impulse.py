@@ -16,6 +16,7 @@ Source: Chatterjee & Ruina, J. Applied Mechanics 65 (1998) 939, for the splittin
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -43,14 +44,14 @@ def effective_matrix(at_a: Placed, at_b: Placed, point: Array) -> Array:
 
 def times(K: Array, P: Array) -> Array:
     """K P, (D, D, *batch), (D, *batch) -> (D, *batch). K is symmetric."""
-    return sum((K[i] * P[i : i + 1] for i in range(1, K.shape[0])), K[0] * P[:1])
+    return jax.vmap(dot, in_axes=(1, None))(K, P)
 
 
 def inverse_times(K: Array, r: Array) -> Array:
     """K^-1 r by cofactors, 2 x 2 or 3 x 3; 0 where K is singular."""
     if K.shape[0] == 2:
         adjoint = -perp(times(K, perp(r)))
-        return safe_divide(adjoint, (K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0])[None])
+        return safe_divide(adjoint, dot(perp(K[0]), K[1])[None])
     bc, ca, ab = cross(K[1], K[2]), cross(K[2], K[0]), cross(K[0], K[1])
     return safe_divide(jnp.stack([dot(bc, r), dot(ca, r), dot(ab, r)]), dot(K[0], bc)[None])
 

@@ -155,19 +155,32 @@ def _pick(live: Array, now: Array, sides: Any) -> Any:
 
 
 def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
-    """Sum over one of the two axes of weights (A, B, *batch) times values (A or B, F, *batch) along that axis.
+    """Sum over one of the two axes of constant weights (A, B, *batch) times values (A or B, F, *batch) along it.
 
-    Term by term: XLA's own reduction of such a product takes twice the time.
+    Its transpose is the sum over the other axis, and is given as that: JAX's own would add up one padded term
+    after the other. `custom_linear_solve` is the way to state a transpose that all transformations know.
     """
+    size, batch = max(weights.shape[:2]), weights.shape[2:]
 
+    def filled(rows):
+        rows = jnp.broadcast_to(rows, rows.shape[:2] + batch)
+        return jnp.pad(rows, [(0, size - rows.shape[0]), *[(0, 0)] * (rows.ndim - 1)])
+
+    def along(axis):
+        return lambda _, rows: filled(_sum_of_terms(weights, rows[: weights.shape[axis]], axis))
+
+    total = lax.custom_linear_solve(lambda rows: rows, filled(values), along(axis), along(1 - axis))
+    return total[: weights.shape[1 - axis]]
+
+
+def _sum_of_terms(weights: Array, values: Array, axis: int) -> Array:
+    # Term by term: XLA's own reduction of such a product takes twice the time.
     def add(total, term):
         k, value = term
         weight = lax.dynamic_index_in_dim(weights, k, axis, keepdims=False)
         return total + weight[:, None] * value[None], None
 
-    count = values.shape[0]
-    batch = jnp.broadcast_shapes(weights.shape[2:], values.shape[2:])
-    zero = jnp.zeros((weights.shape[1 - axis], values.shape[1], *batch), values.dtype)
+    count, zero = values.shape[0], jnp.zeros((weights.shape[1 - axis], *values.shape[1:]), values.dtype)
     return lax.scan(add, zero, (jnp.arange(count), values), unroll=min(count, 16))[0]
 
 
