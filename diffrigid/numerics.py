@@ -70,7 +70,7 @@ def packed_map(fn: Callable[[Array], Array], tree: Any, batch_rank: int) -> Any:
         for k, column in zip(members, columns, strict=True):
             part, start = whole[:, start : start + column.shape[1]], start + column.shape[1]
             mapped[k] = part.reshape(part.shape[0], *leaves[k].shape[1 : leaves[k].ndim - batch_rank], *part.shape[2:])
-    return treedef.unflatten(mapped)
+    return jax.tree.unflatten(treedef, mapped)
 
 
 def fence(live: Array, tree: Any) -> Any:
@@ -92,7 +92,7 @@ def fence(live: Array, tree: Any) -> Any:
     def mixed_up(leaves):  # were a leaf the same in both branches, it would bypass the choice
         return [leaves[following[k]] if following[k] != k else leaf[::-1] for k, leaf in enumerate(leaves)]
 
-    return treedef.unflatten(lax.cond(live, lambda leaves: leaves, mixed_up, leaves))
+    return jax.tree.unflatten(treedef, lax.cond(live, lambda leaves: leaves, mixed_up, leaves))
 
 
 @functools.cache

@@ -116,7 +116,7 @@ def vertices(shape: Shape, dim: int) -> Array:
             return jnp.stack([x] + [jnp.zeros_like(x)] * (dim - 1), axis=1)
         case Box():
             half = floats(shape.half)
-            return _box_signs(dim, half.ndim - 1, half.dtype) * half[None]
+            return jnp.asarray(_box_signs(dim, half.ndim - 1, half.dtype)) * half[None]
         case Polygon() | Hull():
             return floats(shape.vertices)
     raise ValueError(f"{type(shape).__name__} has no vertices; it needs its own colliders.")

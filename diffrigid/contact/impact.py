@@ -103,7 +103,7 @@ def _approach_straight(a: Side, b: Side, width: Array | None) -> tuple[Array, Ar
     D_exact = closing * closing - W2 * excess
 
     if width is None:
-        D, raised, level = D_exact, 0.0, jnp.zeros_like(D_exact)
+        D, raised, level = D_exact, jnp.zeros_like(D_exact), jnp.zeros_like(D_exact)
     else:
         D = _if_smooth(width, lambda D: softplus(D, 2.0 * R * W2 * width), lambda D: jnp.maximum(D, 0.0), D_exact)
         raised = safe_divide(D - D_exact, W2)
@@ -150,9 +150,11 @@ def _approach_search(a: Side, b: Side, t1: Array, width: Array | None) -> tuple[
     frozen_a, frozen_b = lax.stop_gradient((a, b))
     size = jnp.minimum(reach_of(a), reach_of(b))
     near = _advance(frozen_a, frozen_b, start, t1, NEAR * size)
-    level = _if_smooth(
-        width, lambda near: _closest_level(a, b, near, t1 - start, width), lambda near: jnp.zeros_like(near), near
-    )
+
+    def smooth(near):
+        return _closest_level(a, b, near, t1 - start, width)  # type: ignore[arg-type]
+
+    level = _if_smooth(width, smooth, jnp.zeros_like, near)
     s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size)
     return jnp.where(s < bound, start, s), level, found
 

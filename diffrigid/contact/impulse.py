@@ -66,8 +66,7 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
     Differentiable except at the switches: separating to closing, stick to slip.
     """
     Kn, v_n = times(K, n), dot(n, v)
-    mass_n = safe_divide(1.0, dot(n, Kn))
-    gamma = jnp.maximum(mass_n * (target - v_n), 0.0)
+    gamma = jnp.maximum(safe_divide(target - v_n, dot(n, Kn)), 0.0)
     after = v + gamma[None] * Kn
     slip = after - dot(n, after)[None] * n
     Q = friction_impulse(K, n, Kn, gamma, slip, mu)

@@ -20,11 +20,11 @@ from diffrigid.collide import PairGroup
 from diffrigid.contact.impact import approach, closed_form
 from diffrigid.contact.impulse import contact_law
 from diffrigid.contact.sides import Side, side_of
-from diffrigid.contact.strikes import MATERIALS, Material, material, mixed, strikes_of
+from diffrigid.contact.strikes import MATERIALS, Material, material, mixed, relative_path_is_straight, strikes_of
 from diffrigid.flight import Flight
-from diffrigid.forces import is_uniform
 from diffrigid.numerics import constant, dot, fence, packed_map, rows
 from diffrigid.pytree import replace
+from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
 RESTS = -1e30  # [s] stands for an impact after which bodies stay together
@@ -44,17 +44,23 @@ class Grid(NamedTuple):
 
 def is_crowded(world: Any) -> bool:
     """Whether a world is crowded with round shapes, whose impact times have a closed form. Static."""
-    straight, count = is_uniform(world.forces), sum(len(pairs.a) for pairs in world.pairs)
-    kinds = [(world.shapes[pairs.shape_a], world.shapes[pairs.shape_b]) for pairs in world.pairs]
-    return count > CROWDED * len(world.names) and all(closed_form(a, b, straight) for a, b in kinds)
+    moving, count = len(world.names), sum(len(pairs.a) for pairs in world.pairs)
+
+    def solved(pairs: PairGroup) -> bool:
+        straight = relative_path_is_straight(world, max(pairs.a + pairs.b) < moving)
+        return closed_form(world.shapes[pairs.shape_a], world.shapes[pairs.shape_b], straight)
+
+    return count > CROWDED * moving and all(map(solved, world.pairs))
 
 
 def grid_of(pairs: PairGroup) -> Grid:
     """The table that holds the pairs of a group."""
-    row_of_a, row_of_b = (dict(sorted(zip(*c, strict=True))) for c in ((pairs.a, pairs.row_a), (pairs.b, pairs.row_b)))
+    row_of_a = dict(sorted(zip(pairs.a, pairs.row_a, strict=True)))
+    row_of_b = dict(sorted(zip(pairs.b, pairs.row_b, strict=True)))
     there = set(zip(pairs.a, pairs.b, strict=True))
     allowed = tuple(tuple(float((i, j) in there) for j in row_of_b) for i in row_of_a)
-    return Grid(pairs, *(tuple(r.values()) for r in (row_of_a, row_of_b)), tuple(row_of_a), tuple(row_of_b), allowed)
+    rows_a, rows_b = tuple(row_of_a.values()), tuple(row_of_b.values())
+    return Grid(pairs, rows_a, rows_b, tuple(row_of_a), tuple(row_of_b), allowed)
 
 
 def partners(world: Any, grids: tuple[Grid, ...], flight: Flight, since: Array, dt: Array):
@@ -78,7 +84,7 @@ def partners(world: Any, grids: tuple[Grid, ...], flight: Flight, since: Array, 
         earliest = rows(first, grid.a)[:, None]
         if min(grid.b) < moving:
             earliest = jnp.minimum(earliest, rows(first, grid.b)[None])
-        nows.append((s - earliest <= tie).astype(dt.dtype))  # inf - inf is not
+        nows.append((s - earliest <= tie[None, None]).astype(dt.dtype))  # inf - inf is not
     for grid, now in zip(grids, nows, strict=True):
         count = count + _at_bodies(_fold(jnp.add, now, 1), grid.a, moving, 0.0)
         count = count + _at_bodies(_fold(jnp.add, now, 0), grid.b, moving, 0.0)
@@ -87,12 +93,13 @@ def partners(world: Any, grids: tuple[Grid, ...], flight: Flight, since: Array, 
 
 def _next_times(world: Any, grid: Grid, flight: Flight, since: Array, dt: Array) -> Array:
     """Time of the next impact of every pair, (A, B, *batch) [s]; inf: none in this step; RESTS: no rebound."""
-    straight, rest_speed = is_uniform(world.forces), world.contact.rest_speed
+    straight = relative_path_is_straight(world, max(grid.a + grid.b) < len(world.names))
+    rest_speed = world.contact.rest_speed
 
     def one(a: Side, b: Side, allowed: Array, e_a: Material, e_b: Material) -> Array:
         s, _, found, u = approach(a, b, dt, None, straight)
         rests = u <= rest_speed
-        if b.flight is None:  # two that fall alike do not fall on each other
+        if isinstance(b.shape, HalfSpace):  # seen from the other, the path of any other pair is straight
             n = rotations(b.x.shape[0]).rotate(b.q, b.shape.normal)
             rests = rests | (2.0 * mixed(e_a, e_b) * u <= -dot(n, a.flight.a) * (dt - s))
         return jnp.where(found & (s <= dt) & (allowed > 0), jnp.where(rests, RESTS, s), jnp.inf)
@@ -105,7 +112,7 @@ def _next_times(world: Any, grid: Grid, flight: Flight, since: Array, dt: Array)
 class Blows(NamedTuple):
     """What the impacts of a pass do to each body."""
 
-    count: Array  # (N, *batch) impacts, 0 or 1
+    hits: Array  # (N, *batch) 0 or 1
     s: Array  # (N, *batch) [s] sum of their times
     P: Array  # (N, D, *batch) [N s] sum of impulses
     turn: Array  # (N, A, *batch) [N m s] sum of r x P
@@ -120,18 +127,23 @@ def meet(world: Any, grids: tuple[Grid, ...], nows: list[Array], flight: Flight,
         own, others = ([material(world, name, colliders) for name in MATERIALS] for colliders in (grid.a, grid.b))
         partner, others = _pick(live, now, (b, others))
         e, mu = map(mixed, own, others)
-        strikes = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, False, None))(a, partner)
+        strikes = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, partner)
         k = fence(live, jax.tree.map(lambda leaf: leaf[:, 0], replace(strikes, gap=None, push=None)))
         on = _fold(jnp.add, now, 1) * k.active.astype(now.dtype)
         target = -e * jax.vmap(dot)(k.normal, k.v_rel)
         P = jnp.where(on[:, None] > 0, jax.vmap(contact_law)(k.K, k.normal, k.v_rel, target, mu), 0.0)
         blows = Blows(on, on * k.s, P, jax.vmap(so.moment)(k.arm_a, P))
         blows, minus = fence(live, (blows, Blows(on, on * k.s, -P, jax.vmap(so.moment)(k.arm_b, -P))))
-        parts.append(jax.tree.map(lambda value, grid=grid: _at_bodies(value, grid.a, moving, 0.0), blows))
+        parts.append(Blows(*(_at_bodies(value, grid.a, moving, 0.0) for value in blows)))
         if min(grid.b) < moving:
-            blows = packed_map(lambda values, now=now: fence(live, _weighted_sum(now, values, 0)), minus, now.ndim - 2)
-            parts.append(jax.tree.map(lambda value, grid=grid: _at_bodies(value, grid.b, moving, 0.0), blows))
+            blows = packed_map(functools.partial(_across, live, now), minus, now.ndim - 2)
+            parts.append(Blows(*(_at_bodies(value, grid.b, moving, 0.0) for value in blows)))
     return jax.tree.map(lambda *values: sum(values), *parts)
+
+
+def _across(live: Array, now: Array, values: Array) -> Array:
+    """From the rows of side a, (A, F, *batch), to those of side b which they meet."""
+    return fence(live, _weighted_sum(now, values, 0))
 
 
 def _fold(op: Any, table: Array, axis: int) -> Array:

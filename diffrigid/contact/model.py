@@ -183,7 +183,7 @@ def _meet_partners(world: Any, grids: tuple, anchors: Anchors, launch: Callable,
     """The anchors after impacts of bodies that have one partner each."""
     so, flight = rotations(world.dim), launch(anchors.state, anchors.t0)
     blows = meet(world, grids, nows, flight, anchors.since, dt)
-    hit = blows.count > 0
+    hit = blows.hits > 0
     t = jnp.where(hit, blows.s, flight.t0)
     q, mobility = _posed(flight, t)
     changes = mobility.inverse_mass[:, None] * blows.P, jax.vmap(so.apply)(mobility.inverse_inertia, blows.turn)
@@ -206,10 +206,11 @@ def _anchored(anchors: Anchors, flight: Flight, t, q, hit, changes, kick, lever)
     """
     so = rotations(flight.dim)
 
-    def struck(f, t, q, dv, dw, lever):
+    def struck(f: Flight, t: Array, q: Array, dv: Array, dw: Array, lever: Array) -> State:
         w = so.unspin(f.inverse_inertia, q, angular_momentum(f, t))
         x = position(f, t) + lever[None] * dv
         return State(x=x, q=so.turn_by(lever[None] * dw, q), v=velocity(f, t) + kick * dv, w=w + kick * dw)
 
-    state = jax.vmap(struck)(flight, t, q, *changes, lever)
+    dv, dw = changes
+    state = jax.vmap(struck)(flight, t, q, dv, dw, lever)
     return Anchors(state=state, t0=t, since=jnp.where(hit, t, anchors.since))

@@ -36,9 +36,10 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     return replace(strikes, **ends(world))
 
 
-def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array | bool, width: Array | None) -> Strikes:
+def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Strikes:
     """The contacts of one pair, (K, ...); see `find_strikes`."""
-    straight, rest_speed = is_uniform(world.forces), world.contact.rest_speed
+    both_move = a.flight is not None and b.flight is not None
+    straight, rest_speed = relative_path_is_straight(world, both_move), world.contact.rest_speed
     s, hit, level, slack = find_impact(a, b, dt, width, straight, rest_speed, at_end)
     at_a, at_b = place(a, s), place(b, s)
     contacts = contacts_of(a, at_a, b, at_b)
@@ -53,6 +54,11 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array | bool, wi
         )  # fmt: skip
 
     return replace(jax.vmap(each)(contacts.normal, contacts.point, contacts.gap), active=active)
+
+
+def relative_path_is_straight(world: Any, both_move: bool) -> bool:
+    """Whether a body's path is a straight line as seen from another: two fall alike, but not one and a static."""
+    return is_uniform(world.forces) if both_move else not world.forces
 
 
 def may_meet(world: Any, flight: Flight, dt: Array) -> Array:

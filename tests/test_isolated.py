@@ -1,0 +1,71 @@
+"""Crowds of discs: impacts that are alone on their bodies go a faster way, to the same states and derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+from diffrigid.contact import isolated
+
+STEPS = 24
+ROUNDING = 1e-9  # relative: of some dozen impacts, each of which magnifies it
+
+
+def crowd(angle):
+    """Five spinning discs that differ in everything, between three walls and a floor, on their way to each other."""
+    rng = np.random.default_rng(3)
+    bodies = {}
+    for k in range(5):
+        phi = 2 * np.pi * k / 5 + angle
+        at, radius = np.array([np.cos(phi), np.sin(phi)]), 0.2 + 0.02 * k
+        own = {"mass": 1.0 + 0.3 * k, "w": rng.normal(), "restitution": 0.7 if k == 2 else None}
+        bodies[f"d{k}"] = dr.Body(dr.Disc(radius=radius), x=0.6 * at, v=-1.5 * at + rng.normal(size=2), **own)
+    for k, n in enumerate([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]):
+        bodies[f"wall{k}"] = dr.Static(dr.HalfSpace(normal=n, offset=-1.0))
+    return dr.scene(bodies, gravity=(0.3, -9.81), restitution=0.9, friction=0.3)
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    pairs = [crowd(angle) for angle in (0.0, 0.4, 0.9)]
+    return pairs[0][0], jax.tree.map(lambda *leaves: jnp.stack(leaves), *(state for _, state in pairs))
+
+
+def heights(world, states):
+    """The sum of all weighted final positions, and the states."""
+    end = dr.rollout_batch(world, states, dt=1 / 60, steps=STEPS, final_only=True)
+    return (end.x * jnp.arange(1.0, 1.0 + end.x.size).reshape(end.x.shape)).sum(), end
+
+
+def test_the_fast_way_is_the_general_way(worlds, monkeypatch):
+    """States, and reverse mode of one against forward mode of the other, along one direction for all leaves."""
+    assert isolated.is_crowded(worlds[0])
+    (_, end), grad = jax.value_and_grad(heights, argnums=(0, 1), has_aux=True)(*worlds)
+    along = jax.tree.map(lambda leaf: jnp.cos(jnp.arange(1.0, 1.0 + leaf.size)).reshape(leaf.shape), worlds)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grad))
+    monkeypatch.setattr(isolated, "CROWDED", np.inf)
+    jax.clear_caches()
+    _, slope, expected = jax.jvp(lambda *args: heights(*args), worlds, along, has_aux=True)
+    assert (np.abs(end.v - worlds[1].v).max(2) > 0.5).all()  # each was struck
+    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=ROUNDING), end, expected)
+    products = jax.tree.leaves(jax.tree.map(lambda a, b: (a * b).sum(), grad, along))
+    assert_allclose(sum(products), slope, rtol=100 * ROUNDING)
+
+
+def test_a_disc_falls_on_a_disc_that_stands_still():
+    """Two bodies fall alike, but not one and a static: bounce height e^2 h over the top of a peg, and its slope."""
+
+    def height(e, drop, x):
+        bodies = {
+            "ball": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=jnp.stack([x, 0.3 + drop])),
+            "peg": dr.Static(dr.Disc(radius=0.2)),
+        }
+        world, state = dr.scene(bodies, gravity=(0.0, -9.81), restitution=e)
+        duration = jnp.sqrt(2 * drop / 9.81) * (1 + e)
+        return dr.rollout(world, state, dt=1 / 60, times=jnp.stack([0.0, duration]), substeps=(30,)).state.x[-1, 0, 1]
+
+    value, slopes = jax.value_and_grad(height, argnums=(0, 1))(0.8, 0.5, 0.0)
+    assert_allclose(value, 0.3 + 0.64 * 0.5, rtol=1e-12)
+    assert_allclose(slopes, (2 * 0.8 * 0.5, 0.64), rtol=1e-9)
