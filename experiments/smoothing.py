@@ -2,12 +2,14 @@
 
     python experiments/smoothing.py
 
-Three figures, written to smoothing.json: the error of a full hit against the exact law as the width falls; the
-share of billiard shots, all aimed to miss, that end on the target after annealing the width from two thirds of
-the sum of the radii to zero; and the share of starts from which restitution and speed are found from the
-heights of a ball that bounces three times.
+Three figures, written to smoothing.json: the error of a full hit against the exact law as the width falls, also
+drawn in smoothing.svg beside its rate, width exp(-depth / width) with the depth of the exact paths; the share of
+billiard shots, all aimed to miss, that end on the target after annealing the width from two thirds of the sum of
+the radii to zero; and the share of starts from which restitution and speed are found from the heights of a ball
+that bounces three times.
 
-Result of 2026-11-21: printed by the run; see the README.
+2026-11-21, 2 cores: errors 3.2e-2 m (width 80 mm) to 6e-11 m (5 mm); 80 of 80 shots (none with exact gradients);
+144 of 144 starts.
 """
 
 import json
@@ -17,6 +19,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrigid as dr
@@ -57,6 +60,20 @@ def width_error():
     v = jnp.array([2.0, 0.0])
     exact = shot(v, 0.0)
     return [(width, float(jnp.abs(shot(v, width) - exact).max())) for width in (0.08, 0.04, 0.02, 0.01, 0.005)]
+
+
+def draw(errors):
+    """The errors over 1 / width, and a line of the rate through the last: depth (R^2 - offset^2) / 2 R, R the sum."""
+    reach = 2 * RADIUS
+    depth = (reach**2 - 0.05**2) / (2 * reach)
+    width, error = np.array(errors).T
+    line = width / width[-1] * np.exp(depth / width[-1] - depth / width) * error[-1]
+    figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
+    axes.semilogy(1e-3 / width, error, "o", label="error of the ball's place after a hit")
+    axes.semilogy(1e-3 / width, line, "-", label="rate: width exp(-depth / width)")
+    axes.set(xlabel="1 / width [1/mm]", ylabel="error [m]")
+    axes.legend()
+    figure.savefig(Path(__file__).with_suffix(".svg"))
 
 
 def aims():
@@ -120,6 +137,7 @@ def main():
     began = time.time()
     out = {"width [m], error [m]": width_error(), "billiard aims": aims(), "three bounces": bounces()}
     out["seconds"] = round(time.time() - began, 1)
+    draw(out["width [m], error [m]"])
     print(json.dumps(out, indent=1))
     Path(__file__).with_suffix(".json").write_text(json.dumps(out, indent=1) + "\n")
 

@@ -104,7 +104,6 @@ def test_angular_momentum_is_kept_in_elastic_collisions(dim):
     assert_allclose(L, np.broadcast_to(L[:, :1], L.shape), atol=10 * ROUNDING)  # [kg m^2/s], about 1
 
 
-@pytest.mark.xfail(strict=True, reason="a resting contact acts at the end of the step but moves bodies before it")
 @pytest.mark.parametrize("dim", [2, 3])
 def test_angular_momentum_is_kept_where_bodies_may_stay_together(dim):
     _, _, L, _ = crowds(dim)

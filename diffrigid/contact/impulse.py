@@ -31,14 +31,14 @@ JAMMED = (
 )
 
 
-def effective_matrix(at_a: Placed, at_b: Placed, point: Array) -> Array:
-    """K at a world point, (D, D, *batch) [1/kg]: change of the relative velocity for a unit impulse."""
+def effective_matrix(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
+    """K, (D, D, *batch) [1/kg]: change of the relative velocity for a unit impulse at these arms (D, *batch) [m]."""
     K: Any = 0.0
-    for at in (at_a, at_b):
+    for at, arm in ((at_a, arm_a), (at_b, arm_b)):
         if at.v is not None:
             dim = at.x.shape[0]
             unit = jnp.eye(dim, dtype=at.x.dtype).reshape(dim, dim, *[1] * (at.x.ndim - 1))
-            K = K + at.inverse_mass[None, None] * unit + rotations(dim).mobility(at.inverse_inertia, point - at.x)
+            K = K + at.inverse_mass[None, None] * unit + rotations(dim).mobility(at.inverse_inertia, arm)
     return K
 
 

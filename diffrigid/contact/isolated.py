@@ -128,7 +128,7 @@ def meet(world: Any, grids: tuple[Grid, ...], nows: list[Array], flight: Flight,
         partner, others = _pick(live, now, (b, others))
         e, mu = map(mixed, own, others)
         strikes = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, partner)
-        k = fence(live, jax.tree.map(lambda leaf: leaf[:, 0], replace(strikes, gap=None, push=None)))
+        k = fence(live, jax.tree.map(lambda leaf: leaf[:, 0], replace(strikes, gap=None, push=None, drift=None)))
         on = _fold(jnp.add, now, 1) * k.active.astype(now.dtype)
         target = -e * jax.vmap(dot)(k.normal, k.v_rel)
         P = jnp.where(on[:, None] > 0, jax.vmap(contact_law)(k.K, k.normal, k.v_rel, target, mu), 0.0)

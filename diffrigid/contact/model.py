@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.isolated import grid_of, is_crowded, meet, partners
-from diffrigid.contact.resting import Mobility, Strikes, solve_impulses, velocity_changes
+from diffrigid.contact.resting import Mobility, Strikes, momentum_changes, solve_impulses, velocities
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
 from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
@@ -176,18 +176,23 @@ def _apply(anchors: Anchors, flight: Flight, strikes: Strikes, target, mu, kick:
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
     q, mobility = _posed(flight, t)
     P = solve_impulses(strikes, target, mu, mobility, count)
-    return _anchored(anchors, flight, t, q, count > 0, velocity_changes(strikes, P, mobility), kick, lever)
+    dp, dL = momentum_changes(strikes, P, moving)
+    dv, dw = velocities(mobility, dp, dL)
+    moved = lever[:, None] * dv, lever[:, None] * dw
+    # A displacement P / m moves the angular momentum about the origin by P x v: both bodies give back half of it.
+    _, kept = momentum_changes(replace(strikes, arm_a=strikes.drift, arm_b=-strikes.drift), P, moving)
+    return _anchored(anchors, flight, t, q, count > 0, (kick * dv, kick * dL + (1.0 - kick) * kept), moved)
 
 
 def _meet_partners(world: Any, grids: tuple, anchors: Anchors, launch: Callable, nows, dt: Array) -> Anchors:
     """The anchors after impacts of bodies that have one partner each."""
-    so, flight = rotations(world.dim), launch(anchors.state, anchors.t0)
+    flight = launch(anchors.state, anchors.t0)
     blows = meet(world, grids, nows, flight, anchors.since, dt)
     hit = blows.hits > 0
     t = jnp.where(hit, blows.s, flight.t0)
-    q, mobility = _posed(flight, t)
-    changes = mobility.inverse_mass[:, None] * blows.P, jax.vmap(so.apply)(mobility.inverse_inertia, blows.turn)
-    return _anchored(anchors, flight, t, q, hit, changes, jnp.ones((), dt.dtype), jnp.zeros_like(t))
+    q, still = jax.vmap(orientation)(flight, t), jnp.zeros_like(blows.turn)
+    kicked = flight.inverse_mass[:, None] * blows.P, blows.turn
+    return _anchored(anchors, flight, t, q, hit, kicked, (jnp.zeros_like(blows.P), still))
 
 
 def _posed(flight: Flight, t: Array) -> tuple[Array, Mobility]:
@@ -197,20 +202,21 @@ def _posed(flight: Flight, t: Array) -> tuple[Array, Mobility]:
     return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse)
 
 
-def _anchored(anchors: Anchors, flight: Flight, t, q, hit, changes, kick, lever) -> Anchors:
-    """Every body anchored anew at its time t, after changes (dv, dw) of its velocities.
+def _anchored(anchors: Anchors, flight: Flight, t, q, hit, kicked, moved) -> Anchors:
+    """Every body anchored anew at its time t.
 
     Args:
         q: orientations at t.
         hit: (N, *batch) bool: its path holds from t on only.
+        kicked: changes of v (N, D, *batch) [m/s] and L (N, A, *batch) [N m s].
+        moved: displacement (N, D, *batch) [m] and turn (N, A, *batch) [rad]; L is kept in the turn.
     """
     so = rotations(flight.dim)
 
-    def struck(f: Flight, t: Array, q: Array, dv: Array, dw: Array, lever: Array) -> State:
-        w = so.unspin(f.inverse_inertia, q, angular_momentum(f, t))
-        x = position(f, t) + lever[None] * dv
-        return State(x=x, q=so.turn_by(lever[None] * dw, q), v=velocity(f, t) + kick * dv, w=w + kick * dw)
+    def struck(f: Flight, t: Array, q: Array, dv: Array, dL: Array, dx: Array, turn: Array) -> State:
+        q = so.turn_by(turn, q)
+        w = so.unspin(f.inverse_inertia, q, angular_momentum(f, t) + dL)
+        return State(x=position(f, t) + dx, q=q, v=velocity(f, t) + dv, w=w)
 
-    dv, dw = changes
-    state = jax.vmap(struck)(flight, t, q, dv, dw, lever)
+    state = jax.vmap(struck)(flight, t, q, *kicked, *moved)
     return Anchors(state=state, t0=t, since=jnp.where(hit, t, anchors.since))

@@ -28,6 +28,7 @@ class Strikes:
     K: Array = array("C", "D", "D")  # [1/kg] effective matrix
     v_rel: Array = array("C", "D")  # [m/s] of a against b at the contact point, before the impulse
     push: Array = array("C")  # [m/s^2] closing acceleration along the normal
+    drift: Array = array("C", "D")  # [m/s] half the velocity of a against b, of the centres; 0 at a static
     a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
     b: tuple[int, ...] = static(default=())
 
@@ -50,14 +51,19 @@ class Mobility:
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
 
 
-def velocity_changes(arms: Strikes | Arms, P: Array, mobility: Mobility) -> tuple[Array, Array]:
-    """Changes of v (N, D) [m/s] and w (N, A) [rad/s] of the moving bodies by the impulses P on side a."""
-    so, moving = rotations(P.shape[1]), mobility.inverse_mass.shape[0]
+def momentum_changes(arms: Strikes | Arms, P: Array, moving: int) -> tuple[Array, Array]:
+    """Changes of m v (N, D) [N s] and L (N, A) [N m s] of the moving bodies by the impulses P on side a."""
+    so = rotations(P.shape[1])
     on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a, P)], axis=1)
     on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b, -P)], axis=1)
     total = side_sum(on_a, on_b, arms.a, arms.b, moving)
-    linear, angular = total[:, : so.D], total[:, so.D :]
-    return mobility.inverse_mass[:, None] * linear, jax.vmap(so.apply)(mobility.inverse_inertia, angular)
+    return total[:, : so.D], total[:, so.D :]
+
+
+def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array]:
+    """Changes of v [m/s] and w [rad/s] that go with those of m v and L."""
+    apply = rotations(dp.shape[1]).apply
+    return mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL)
 
 
 def relative_changes(arms: Strikes | Arms, dv: Array, dw: Array) -> Array:
@@ -115,7 +121,8 @@ def _apply_law(law: Law, v: Array) -> Array:
 
 def _others(law: Law, P: Array, arms: Arms, mobility: Mobility) -> Array:
     """Change of the relative velocity at every contact by the impulses at all others, (C, D, *batch) [m/s]."""
-    return relative_changes(arms, *velocity_changes(arms, P, mobility)) - jax.vmap(times)(law.K, P)
+    changes = momentum_changes(arms, P, mobility.inverse_mass.shape[0])
+    return relative_changes(arms, *velocities(mobility, *changes)) - jax.vmap(times)(law.K, P)
 
 
 @jax.custom_jvp

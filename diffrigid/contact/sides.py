@@ -91,30 +91,35 @@ def _origin(side: Side, at: Placed) -> tuple[Array, Array]:
     return at.x + rotations(at.x.shape[0]).rotate(at.q, side.offset), at.q
 
 
-def relative_velocity(at_a: Placed, at_b: Placed, point: Array) -> Array:
-    """Velocity of a against b at a world point, (D, *batch) [m/s]."""
-    return _difference(lambda at: at.v + rotations(at.x.shape[0]).cross(at.w, point - at.x), at_a, at_b)
+def relative_velocity(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
+    """Velocity of a against b at these arms from their centres of mass, (D, *batch) [m/s]."""
+    cross = rotations(arm_a.shape[0]).cross
+    return _difference(lambda at, arm: at.v + cross(at.w, arm), at_a, arm_a, at_b, arm_b)
 
 
 def relative_acceleration(at_a: Placed, at_b: Placed, point: Array) -> Array:
     """Acceleration of a against b at a world point, a + w x (w x r) of each, without angular acceleration."""
 
-    def one(at):
-        so = rotations(at.x.shape[0])
-        return at.a + so.cross(at.w, so.cross(at.w, point - at.x))
+    def one(at, arm):
+        cross = rotations(arm.shape[0]).cross
+        return at.a + cross(at.w, cross(at.w, arm))
 
-    return _difference(one, at_a, at_b)
+    return _difference(one, at_a, point - at_a.x, at_b, point - at_b.x)
 
 
-def _difference(of, at_a: Placed, at_b: Placed) -> Array:
+def _difference(of, at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
     if at_b.v is None:
-        return of(at_a)
-    return -of(at_b) if at_a.v is None else of(at_a) - of(at_b)
+        return of(at_a, arm_a)
+    return -of(at_b, arm_b) if at_a.v is None else of(at_a, arm_a) - of(at_b, arm_b)
 
 
 def gap_rates(contacts: Contacts, at_a: Placed, at_b: Placed) -> Array:
     """d(gap)/ds of every contact, (K, *batch) [m/s]: the normal velocity of a against b at the contact point."""
-    return jax.vmap(lambda n, p: dot(n, relative_velocity(at_a, at_b, p)))(contacts.normal, contacts.point)
+
+    def one(n, p):
+        return dot(n, relative_velocity(at_a, p - at_a.x, at_b, p - at_b.x))
+
+    return jax.vmap(one)(contacts.normal, contacts.point)
 
 
 def reach_of(side: Side) -> Array:
