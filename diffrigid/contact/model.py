@@ -2,7 +2,8 @@
 
     IMPACT, as often as `sweeps`   the next impact of every body, at its true time, with restitution
     HOLD                           what rests, at the end of the step: the velocities must not close
-    PUSH                           what rests: gaps that rounding or rolling left are closed
+    PUSH                           what rests: gaps that rounding or rolling left are closed; momenta are kept,
+                                   energy to the order of the gap
 
 Every pass finds contacts at a time, solves for impulses, and anchors the struck bodies anew; the passes differ
 in the time, the target of the law, and in how long the impulse has acted. A pass that no world of the batch
