@@ -169,19 +169,24 @@ def _repeat(one_round, first: Array, shared: Array) -> Array:
     Each world extrapolates over its last two rounds (Anderson 1965, depth one), which takes a tenth of the rounds.
     """
 
+    def unsettled(x, change):
+        largest = jnp.max(jnp.abs(change), (0, 1))
+        return largest, largest > 4.0 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), (0, 1))
+
     def busy(carry):
         # The change is measured here, on stored arrays: beside the round, XLA would compute the law again for it.
         count, x, _, change = carry
-        return (
-            shared & (count < ROUNDS) & (jnp.max(jnp.abs(change)) > 4.0 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x)))
-        )
+        return shared & (count < ROUNDS) & jnp.any(unsettled(x, change)[1])
 
     def again(carry):
         count, x, before, change_before = carry
         after = one_round(x)
         change = after - x
-        turn = change - change_before
-        share = safe_divide((change * turn).sum((0, 1)), (turn * turn).sum((0, 1)))
+        # A world that has settled waits for the others: what is left there is rounding, and not to be extrapolated.
+        size, moves = unsettled(x, change)
+        scale = jnp.where(moves, 1.0 / jnp.where(moves, size, 1.0), 0.0)[None, None]  # squares do not underflow
+        turn = scale * (change - change_before)
+        share = safe_divide((scale * change * turn).sum((0, 1)), (turn * turn).sum((0, 1)))
         return count + 1, after - share[None, None] * (after - before), after, change
 
     return lax.while_loop(busy, again, (0, first, first, first))[1]
