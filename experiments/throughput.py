@@ -10,8 +10,8 @@ peak memory is that of a process which has run forward before.
 
 One sweep a step: a body that is struck twice in 4 ms is repaired in the next step, as the peers do.
 
-2026-11-21, one quiet core of an AMD EPYC (Zen 5): pymunk 1.4e6 (S1), 6.3e5 (S2); Box2D 6.7e5, 2.5e5; diffrigid 2.3e8 and
-7.3e5, that is 163 and 1.15 times pymunk; gradient over forward 6 (S1, 1024 worlds) and 11 (S2).
+2026-11-21, one quiet core of an AMD EPYC (Zen 5): pymunk 1.4e6 (S1), 6.3e5 (S2); Box2D 6.7e5, 2.5e5; diffrigid
+2.3e8 and 7.3e5, that is 163 and 1.15 times pymunk; gradient over forward 6 (S1, 1024 worlds) and 11 (S2).
 """
 
 import argparse

@@ -22,6 +22,7 @@ from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid.contact.impulse import contact_law
 
 EXACT = 1e-9  # relative: rounding of a few hundred steps
 AT_REST = 1e-9  # [m], [m/s]: rounding of a body that is held for a thousand steps
@@ -221,3 +222,11 @@ def test_parallel_faces_share_the_impulse():
     assert_allclose(state.w, 0.0, atol=EXACT)
     rows = np.array([8, 10])  # the x components of v, after x and q
     assert_allclose(jac[1].v[rows, :, 0], by_speed, atol=EXACT)
+
+
+def test_law_without_friction_is_smooth_where_the_target_makes_energy():
+    """As for a contact that is not active, whose velocity the impulses at others have changed."""
+    K, n, v, target = jnp.eye(2), vector(0.0, 1.0), vector(0.3, -1.0), jnp.asarray(2.0)
+    P, slopes = contact_law(K, n, v, target, jnp.zeros(())), jax.jacrev(contact_law, (0, 1, 2, 3, 4))
+    assert_allclose(P, [0.0, 3.0])
+    assert all(np.isfinite(slope).all() for slope in slopes(K, n, v, target, jnp.zeros(())))

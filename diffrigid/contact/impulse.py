@@ -88,6 +88,6 @@ def friction_impulse(K: Array, n: Array, Kn: Array, gamma: Array, slip: Array, m
 
 def _within_energy(T0: Array, b: Array, c: Array) -> Array:
     """Largest kappa <= 1 for which the kinetic energy does not rise: T0 + b kappa + c kappa^2 / 2 <= 0."""
-    gains = T0 + b + 0.5 * c > 0
+    gains = (T0 + b + 0.5 * c > 0) & (c > 0)
     root = (safe_sqrt(b * b - 2.0 * c * jnp.minimum(T0, 0.0)) - b) / jnp.where(gains, c, 1.0)
     return jnp.where(gains, jnp.clip(root, 0.0, 1.0), 1.0)
