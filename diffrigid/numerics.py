@@ -45,12 +45,10 @@ def rows(values: Array, index: tuple) -> Array:
     reverse mode saves: a program of some hundred contacts took three times as long to compile. This one is
     made once.
     """
-    first = index[0]
-    if isinstance(first, tuple):
-        return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
-    if index == (first,) * len(index):
+    first, flat = index[0], not isinstance(index[0], tuple)
+    if flat and index == (first,) * len(index):
         return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))
-    if index == tuple(range(first, first + len(index))):
+    if flat and index == tuple(range(first, first + len(index))):
         return values[first : first + len(index)]
     return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
 

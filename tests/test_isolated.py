@@ -54,6 +54,28 @@ def test_the_fast_way_is_the_general_way(worlds, monkeypatch):
     assert_allclose(sum(products), slope, rtol=100 * ROUNDING)
 
 
+def test_spheres_go_the_fast_way_as_well(monkeypatch):
+    """Four that tumble, of unequal principal inertias, between six walls."""
+    rng = np.random.default_rng(5)
+    walls = [dr.Static(dr.HalfSpace(normal=tuple(sign * n), offset=-1.0)) for sign in (1.0, -1.0) for n in np.eye(3)]
+    places = 0.5 * np.array([(1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0)])
+    bodies = {
+        f"s{k}": dr.Body(
+            dr.Sphere(radius=0.25), mass=1.0 + k, inertia=(0.02, 0.03, 0.04), x=x, v=-3.0 * x + rng.normal(size=3),
+            w=rng.normal(size=3),
+        )
+        for k, x in enumerate(places)
+    }  # fmt: skip
+    world, state = dr.scene(bodies | {f"wall{k}": wall for k, wall in enumerate(walls)}, restitution=0.9, friction=0.3)
+    assert isolated.is_crowded(world)
+    end = dr.rollout(world, state, dt=1 / 60, steps=2 * STEPS).state
+    monkeypatch.setattr(isolated, "CROWDED", np.inf)
+    jax.clear_caches()
+    expected = dr.rollout(world, state, dt=1 / 60, steps=2 * STEPS).state
+    assert (np.abs(end.v[-1] - state.v).max(1) > 0.5).all()
+    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=ROUNDING), end, expected)
+
+
 def test_a_disc_falls_on_a_disc_that_stands_still():
     """Two bodies fall alike, but not one and a static: bounce height e^2 h over the top of a peg, and its slope."""
 

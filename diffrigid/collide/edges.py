@@ -41,8 +41,7 @@ def crossing_edges(
     """
     edges_a, edges_b = _edges(a, corners_a), _edges(b, corners_b)
     size_a, size_b = edges_a.start.shape[1], edges_b.start.shape[1]
-    # The barrier keeps XLA from placing the edges anew for each of their pairs.
-    down, across, margin = lax.optimization_barrier(lax.stop_gradient((edges_a, edges_b, slack)))
+    down, across, margin = lax.stop_gradient((edges_a, edges_b, slack))
     down, across = Edges(*(leaf[:, :, None] for leaf in down)), Edges(*(leaf[:, None] for leaf in across))
     order = _order(_crossing(down, across, margin[None, None]), separated, margin[None, None])
     order = jnp.moveaxis(order.reshape(size_a * size_b, *slack.shape), 0, -1)

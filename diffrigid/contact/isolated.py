@@ -174,14 +174,14 @@ def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
     """
     size, batch = max(weights.shape[:2]), weights.shape[2:]
 
-    def filled(rows):
-        rows = jnp.broadcast_to(rows, rows.shape[:2] + batch)
-        return jnp.pad(rows, [(0, size - rows.shape[0]), *[(0, 0)] * (rows.ndim - 1)])
+    def filled(values):
+        values = jnp.broadcast_to(values, values.shape[:2] + batch)
+        return jnp.pad(values, [(0, size - values.shape[0]), *[(0, 0)] * (values.ndim - 1)])
 
     def along(axis):
-        return lambda _, rows: filled(_sum_of_terms(weights, rows[: weights.shape[axis]], axis))
+        return lambda _, values: filled(_sum_of_terms(weights, values[: weights.shape[axis]], axis))
 
-    total = lax.custom_linear_solve(lambda rows: rows, filled(values), along(axis), along(1 - axis))
+    total = lax.custom_linear_solve(lambda values: values, filled(values), along(axis), along(1 - axis))
     return total[: weights.shape[1 - axis]]
 
 

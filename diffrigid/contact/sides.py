@@ -137,7 +137,6 @@ def side_sum(values_a: Array, values_b: Array, a: tuple[int, ...], b: tuple[int,
     By gathering each body's contacts, padded to the most any body has: forward it is one fused loop, where a
     scatter is a serial one.
     """
-    values_a, values_b = lax.optimization_barrier((values_a, values_b))
     padded = jnp.concatenate([values_a, values_b, jnp.zeros_like(values_a[:1])])
     return rows(padded, body_sides(a, b, moving)).sum(1)
 
