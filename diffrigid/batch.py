@@ -17,7 +17,7 @@ from diffrigid.state import State
 from diffrigid.step import aligned, final_state, floats, scan_steps
 from diffrigid.world import World
 
-LANES = 2**15  # contacts and bodies times worlds of one chunk: their temporaries fill about the L2 cache
+LANES = 2**15
 
 
 def rollout_batch(

@@ -53,44 +53,48 @@ def rows(values: Array, index: tuple) -> Array:
     return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def packed_map(fn: Callable[[Array], Array], tree: Any, batch_rank: int) -> Any:
-    """The tree with fn(leaf) for every leaf (M, ..., *batch), in one call for all leaves of one batch shape.
+def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]], Any]]:
+    """The leaves (M, ..., *batch) of a tree side by side, as one array (M, F, *batch) for each shape of the batch.
 
-    `fn` acts on the leading axis of (M, F, *batch) arrays and may change its length.
+    Returns:
+        the arrays, and the function that makes the tree from such arrays again, whatever their leading length.
     """
     leaves, treedef = jax.tree.flatten(tree)
     batches = [leaf.shape[leaf.ndim - batch_rank :] for leaf in leaves]
-    mapped: list[Any] = [None] * len(leaves)
-    for batch in set(batches):
-        members = [k for k in range(len(leaves)) if batches[k] == batch]
-        columns = [leaves[k].reshape(leaves[k].shape[0], -1, *batch) for k in members]
-        whole, start = fn(jnp.concatenate(columns, axis=1)), 0
-        for k, column in zip(members, columns, strict=True):
-            part, start = whole[:, start : start + column.shape[1]], start + column.shape[1]
-            mapped[k] = part.reshape(part.shape[0], *leaves[k].shape[1 : leaves[k].ndim - batch_rank], *part.shape[2:])
-    return jax.tree.unflatten(treedef, mapped)
+    insides = [leaf.shape[1 : leaf.ndim - batch_rank] for leaf in leaves]
+    members = [[k for k in range(len(leaves)) if batches[k] == batch] for batch in dict.fromkeys(batches)]
+
+    def column(k: int) -> Array:
+        return leaves[k].reshape(leaves[k].shape[0], -1, *batches[k])
+
+    def unpack(columns: list[Array]) -> Any:
+        parts: dict[int, Array] = {}
+        for whole, group in zip(columns, members, strict=True):
+            start = 0
+            for k in group:
+                stop = start + int(np.prod(insides[k], dtype=int))
+                part, start = whole[:, start:stop], stop
+                parts[k] = part.reshape(part.shape[0], *insides[k], *part.shape[2:])
+        return jax.tree.unflatten(treedef, [parts[k] for k in range(len(leaves))])
+
+    return [jnp.concatenate([column(k) for k in group], axis=1) for group in members], unpack
 
 
-def fence(live: Array, tree: Any) -> Any:
-    """The tree itself, but computed before it is used: XLA does not fuse across a branch.
+def apart(live: Array, fn: Callable, *args: Any) -> Any:
+    """fn(*args), computed by itself: XLA does not fuse across a branch.
 
     Where several results depend on one, XLA on a CPU computes it again inside each of them, and again for each
     component that is picked from it: in a chain of products of vectors this grows exponentially. An
-    `optimization_barrier` is removed before fusion. So the fence is a choice that is always the same.
+    `optimization_barrier` is removed before fusion. So this is a choice that is always the same.
 
     Args:
         live: bool, True, but not known when compiling.
     """
-    leaves, treedef = jax.tree.flatten(tree)
-    alike: dict[Any, list[int]] = {}
-    for k, leaf in enumerate(leaves):
-        alike.setdefault((leaf.shape, leaf.dtype), []).append(k)
-    following = {k: group[(i + 1) % len(group)] for group in alike.values() for i, k in enumerate(group)}
 
-    def mixed_up(leaves):  # were a leaf the same in both branches, it would bypass the choice
-        return [leaves[following[k]] if following[k] != k else leaf[::-1] for k, leaf in enumerate(leaves)]
+    def never(*args):
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(fn, *args))
 
-    return jax.tree.unflatten(treedef, lax.cond(live, lambda leaves: leaves, mixed_up, leaves))
+    return lax.cond(live, fn, never, *args)
 
 
 @functools.cache

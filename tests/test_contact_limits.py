@@ -22,7 +22,7 @@ from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
-from diffrigid.contact.impulse import contact_law
+from diffrigid.contact.impulse import contact_law, impulses
 
 EXACT = 1e-9  # relative: rounding of a few hundred steps
 AT_REST = 1e-9  # [m], [m/s]: rounding of a body that is held for a thousand steps
@@ -230,3 +230,12 @@ def test_law_without_friction_is_smooth_where_the_target_makes_energy():
     P, slopes = contact_law(K, n, v, target, jnp.zeros(())), jax.jacrev(contact_law, (0, 1, 2, 3, 4))
     assert_allclose(P, [0.0, 3.0])
     assert all(np.isfinite(slope).all() for slope in slopes(K, n, v, target, jnp.zeros(())))
+
+
+def test_a_contact_that_is_off_has_no_derivative():
+    """In a list of contacts most are far apart, where the law overflows in float32: 0, and not 0 * inf."""
+    far = {"K": jnp.full((1, 2, 2), 1e25), "n": jnp.array([[0.6, 0.8]]), "v": jnp.full((1, 2), -1e25)}
+    far = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), far | {"target": jnp.ones(1), "mu": jnp.zeros(1)})
+    P, back = jax.vjp(lambda far: impulses(jnp.array([False]), **far), far)
+    assert not P.any()
+    assert all(not leaf.any() for leaf in jax.tree.leaves(back(jnp.ones_like(P))))

@@ -90,15 +90,27 @@ def _earliest(a: Side, b: Side) -> tuple[Array, Array]:
 
 
 def _approach_straight(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:
+    start, bound = _earliest(a, b)
+    (x_a, v_a), (x_b, v_b) = centre(a, start), centre(b, start)
+    s, level, found, speed = meet_on_line(x_a - x_b, v_a - v_b, a.shape.radius + b.shape.radius, width)
+    s = start + s
+    return jnp.where(s < bound, start, s), level, found, speed
+
+
+def meet_on_line(P: Array, W: Array, R: Array, width: Array | None) -> tuple[Array, Array, Array, Array]:
     """Two round shapes whose relative path is a line: |P + W s| = R + level.
 
     With D = (P.W)^2 - W^2 (P^2 - R^2), smooth: D -> eps softplus(D / eps), eps = 2 R W^2 width, and the
     distance at impact is the Rs >= R that this D belongs to.
+
+    Args:
+        P, W: (D, *batch) [m], [m/s] of a against b at time 0.
+        R: (*batch) [m] sum of the radii.
+        width: None is exact.
+
+    Returns:
+        s [s], level [m], whether they meet (bool), closing speed then [m/s]; (*batch).
     """
-    start, bound = _earliest(a, b)
-    (x_a, v_a), (x_b, v_b) = centre(a, start), centre(b, start)
-    P, W = x_a - x_b, v_a - v_b
-    R = a.shape.radius + b.shape.radius
     W2, closing, excess = dot(W, W), -dot(P, W), dot(P, P) - R * R
     D_exact = closing * closing - W2 * excess
 
@@ -109,9 +121,8 @@ def _approach_straight(a: Side, b: Side, width: Array | None) -> tuple[Array, Ar
         raised = safe_divide(D - D_exact, W2)
         level = safe_sqrt(R * R + raised) - R
     root = safe_sqrt(D)
-    s = start + safe_divide(excess - raised, closing + root)
-    found = (closing > 0) & (D > 0)
-    return jnp.where(s < bound, start, s), level, found, root / (R + level)
+    s = safe_divide(excess - raised, closing + root)
+    return s, level, (closing > 0) & (D > 0), root / (R + level)
 
 
 def _if_smooth(width: Array | None, smooth, exact, *args: Array) -> Array:
@@ -120,12 +131,22 @@ def _if_smooth(width: Array | None, smooth, exact, *args: Array) -> Array:
 
 
 def _approach_parabola(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:
-    """A round shape and a half-space at rest: gap(s) = gap + v s + acc s^2 / 2, exactly."""
     so, (start, bound) = rotations(a.flight.dim), _earliest(a, b)
     normal = so.rotate(b.q, b.shape.normal)
     x, velocity = centre(a, start)
     gap = dot(normal, x - b.x) - b.shape.offset - a.shape.radius
-    v, acc = dot(normal, velocity), dot(normal, a.flight.a)
+    s, level, found, root, sunk = meet_on_parabola(gap, dot(normal, velocity), dot(normal, a.flight.a), width)
+    s = start + s
+    return jnp.where(sunk | (s < bound), start, s), level, found, root
+
+
+def meet_on_parabola(gap: Array, v: Array, acc: Array, width: Array | None):
+    """A round shape and a half-space at rest: gap(s) = gap + v s + acc s^2 / 2, exactly; all (*batch).
+
+    Returns:
+        s, level, whether they meet and closing speed as `meet_on_line`; whether it is inside and sinks, with no
+        crossing in the past: then the impact is at once.
+    """
     turns_back = acc > 0
     gap_min = gap - 0.5 * safe_divide(v * v, jnp.where(turns_back, acc, 0.0))
 
@@ -135,13 +156,12 @@ def _approach_parabola(a: Side, b: Side, width: Array | None) -> tuple[Array, Ar
     level = _if_smooth(width, smooth, jnp.zeros_like, gap_min)
     height = gap - level
     root = safe_sqrt(v * v - 2.0 * acc * height)
-    later = safe_divide(v + root, -acc)  # on the way up: the way down
-    sooner = safe_divide(2.0 * height, root - v)
-    s = start + jnp.where(v > 0, later, sooner)
+    up = v > 0  # then the impact is on the way down
+    s = safe_divide(jnp.where(up, v + root, 2.0 * height), jnp.where(up, -acc, root - v))
     # Below the surface and sinking, with no crossing in the past: the impact is now.
     sunk = (height < 0) & (v * v < 2.0 * acc * height)
     found = jnp.where(turns_back, (v < 0) & (root > 0), (v < 0) | (acc < 0)) | sunk
-    return jnp.where(sunk | (s < bound), start, s), level, found, root
+    return s, level, found, root, sunk
 
 
 def _approach_search(a: Side, b: Side, t1: Array, width: Array | None) -> tuple[Array, Array, Array]:

@@ -21,9 +21,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.contact.sides import Placed
-from diffrigid.numerics import dot, norm, normalise, safe_divide, safe_sqrt
-from diffrigid.so2 import perp
-from diffrigid.so3 import cross
+from diffrigid.numerics import dot, safe_divide, safe_sqrt
 from diffrigid.state import rotations
 
 JAMMED = (
@@ -47,13 +45,13 @@ def times(K: Array, P: Array) -> Array:
     return jax.vmap(dot, in_axes=(1, None))(K, P)
 
 
-def inverse_times(K: Array, r: Array) -> Array:
-    """K^-1 r by cofactors, 2 x 2 or 3 x 3; 0 where K is singular."""
-    if K.shape[0] == 2:
-        adjoint = -perp(times(K, perp(r)))
-        return safe_divide(adjoint, dot(perp(K[0]), K[1])[None])
-    bc, ca, ab = cross(K[1], K[2]), cross(K[2], K[0]), cross(K[0], K[1])
-    return safe_divide(jnp.stack([dot(bc, r), dot(ca, r), dot(ab, r)]), dot(K[0], bc)[None])
+def impulses(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
+    """`contact_law` of C contacts, (C, D, *batch) [N s]; 0 with zero derivative for those not `on` (C, *batch).
+
+    These are solved at rest, because far apart the derivative of the law may overflow, and 0 * inf is NaN.
+    """
+    v, target = jnp.where(on[:, None], v, 0.0), jnp.where(on, target, 0.0)
+    return jnp.where(on[:, None], jax.vmap(contact_law)(K, n, v, target, mu), 0.0)
 
 
 def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
@@ -65,25 +63,66 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
 
     Differentiable except at the switches: separating to closing, stick to slip.
     """
-    Kn, v_n = times(K, n), dot(n, v)
-    gamma = jnp.maximum(safe_divide(target - v_n, dot(n, Kn)), 0.0)
-    after = v + gamma[None] * Kn
-    slip = after - dot(n, after)[None] * n
-    Q = friction_impulse(K, n, Kn, gamma, slip, mu)
-    kappa = _within_energy(0.5 * gamma * (v_n + target), dot(Q, after), dot(Q, times(K, Q)))
-    return gamma[None] * n + kappa[None] * Q
+    basis, axes = _contact_frame(n), range(n.shape[0])
+    k: list = [[sum(basis[i][p] * K[p, q] * basis[j][q] for p in axes for q in axes) for j in axes] for i in axes]
+    v_n, *v_t = [sum(basis[i][p] * v[p] for p in axes) for i in axes]
+    gamma = jnp.maximum(safe_divide(target - v_n, k[0][0]), 0.0)
+    after = [v_i + gamma * k_in for v_i, (k_in, *_) in zip([v_n, *v_t], k, strict=True)]
+    Q = _friction_impulse(k, gamma, after[1:], mu)
+    gained = sum(Q[i] * k[i][j] * Q[j] for i in axes for j in axes)
+    kappa = _within_energy(0.5 * gamma * (v_n + target), sum(Q[i] * after[i] for i in axes), gained)
+    P = [gamma + kappa * Q[0], *(kappa * Q_t for Q_t in Q[1:])]
+    return jnp.stack([sum(P[i] * basis[i][p] for i in axes) for p in axes])
 
 
-def friction_impulse(K: Array, n: Array, Kn: Array, gamma: Array, slip: Array, mu: Array) -> Array:
-    """What friction adds to the impulse gamma n, (D, *batch) [N s]. It leaves the normal velocity: n . K Q = 0."""
-    stop = -inverse_times(K, slip)
-    stop_n = dot(n, stop)
+def _contact_frame(n: Array) -> list[list[Array]]:
+    """Components of n and of the unit tangents; in 3D after Duff et al., J. Computer Graphics Techniques 6 (2017) 1."""
+    if n.shape[0] == 2:
+        return [[n[0], n[1]], [-n[1], n[0]]]
+    x, y, z = n
+    sign = jnp.where(z < 0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return [[x, y, z], [1.0 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]]
+
+
+def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array) -> list:
+    """What friction adds to the impulse gamma n [N s], in the contact frame. It leaves the normal velocity.
+
+    Args:
+        k: K in the contact frame.
+        slip: tangential velocity after gamma n [m/s].
+    """
+    stop = _stopping_impulse(k, slip)
     # sliding: P = gamma_s (n - mu along), with gamma_s such that the normal law holds
-    along = normalise(slip)
-    share = 1.0 - mu * safe_divide(dot(Kn, along), dot(n, Kn))
-    sticks = (norm(stop - stop_n[None] * n) <= mu * (gamma + stop_n)) | (share < JAMMED)
-    slide = (gamma / jnp.where(sticks, 1.0, share))[None] * (n - mu[None] * along) - gamma[None] * n
-    return jnp.where(sticks[None], stop, slide)
+    speed = safe_sqrt(sum(s * s for s in slip))
+    along = [safe_divide(s, speed) for s in slip]
+    share = 1.0 - mu * safe_divide(sum(k_nt * e for k_nt, e in zip(k[0][1:], along, strict=True)), k[0][0])
+    bound = mu * (gamma + stop[0])
+    sticks = (safe_sqrt(sum(P * P for P in stop[1:])) <= bound) | (share < JAMMED)
+    slides = gamma / jnp.where(sticks, 1.0, share)
+    slide = [slides - gamma, *(-mu * slides * e for e in along)]
+    return [jnp.where(sticks, P, Q) for P, Q in zip(stop, slide, strict=True)]
+
+
+def _stopping_impulse(k: list, slip: list) -> list:
+    """-K^-1 (0, slip), by cofactors, 2 x 2 or 3 x 3; 0 where K is singular."""
+    if len(k) == 2:
+        (nn, nt), (_, tt) = k
+        share = safe_divide(slip[0], nn * tt - nt * nt)
+        return [nt * share, -nn * share]
+    (nn, ns, nt), (_, ss, st), (_, _, tt) = k
+    # rows of the adjugate for the two tangents s and t
+    ns_, nt_, ss_, st_, tt_ = (
+        st * nt - ns * tt,
+        ns * st - ss * nt,
+        nn * tt - nt * nt,
+        ns * nt - nn * st,
+        nn * ss - ns * ns,
+    )
+    det = nn * (ss * tt - st * st) + ns * ns_ + nt * nt_
+    s, t = slip
+    return [-safe_divide(P, det) for P in (ns_ * s + nt_ * t, ss_ * s + st_ * t, st_ * s + tt_ * t)]
 
 
 def _within_energy(T0: Array, b: Array, c: Array) -> Array:

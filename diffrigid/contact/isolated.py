@@ -1,15 +1,16 @@
 """Impacts of round shapes that are alone on their bodies: the usual step of a world of many discs or spheres.
 
-The general pass evaluates every contact of every pair. Here only the *times* are found for all pairs, on the
-grid of bodies against bodies, in one kernel without derivative; then each body that is struck meets its one
-partner. The partner is picked by a product with zeros and ones and summed over the grid, which unlike a gather
-along the batch is vectorised, in both directions. 16 discs between walls run ten times as fast.
+The general pass evaluates every contact of every pair. Here only the *times* are found for all pairs, without
+derivative, and each body keeps its next one. The next few impacts of each world are then gathered into slots,
+and only these are evaluated. A slot takes its two bodies by a product with zeros and ones, summed over the
+bodies, which unlike a gather along the batch is vectorised, in both directions.
 
 A pass goes this way if it is an impact pass and, in all worlds of the batch, no body is in two contacts at the
-same time and none comes to rest; else the general way, to the same result.
+same time, none comes to rest, and the slots suffice; else the general way, to the same result.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,153 +18,342 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.collide import PairGroup
-from diffrigid.contact.impact import approach, closed_form
-from diffrigid.contact.impulse import contact_law
+from diffrigid.contact.anchors import Anchors, struck
+from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
+from diffrigid.contact.impulse import impulses
+from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
 from diffrigid.contact.strikes import MATERIALS, Material, material, mixed, relative_path_is_straight, strikes_of
-from diffrigid.flight import Flight
-from diffrigid.numerics import constant, dot, fence, packed_map, rows
+from diffrigid.flight import Flight, orientation, position, velocity
+from diffrigid.numerics import apart, constant, dot, pack, safe_sqrt
 from diffrigid.pytree import replace
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
 RESTS = -1e30  # [s] stands for an impact after which bodies stay together
-CROWDED = 4  # pairs per body from which the grid is faster than the list of pairs
+CROWDED = 4  # pairs per body from which this way is faster than the list of pairs
+SHARE = 4  # bodies for each slot
 
 
-class Grid(NamedTuple):
-    """All pairs of one kind as a table of A rows of side a and B of side b; `allowed` says which are pairs."""
+class Table(NamedTuple):
+    """The pairs of one kind: all N bodies against each other, or against B statics."""
 
     pairs: PairGroup
-    rows_a: tuple[int, ...]  # of world.shapes
-    rows_b: tuple[int, ...]
-    a: tuple[int, ...]  # colliders
-    b: tuple[int, ...]
-    allowed: tuple[tuple[float, ...], ...]  # (A, B) 1 or 0
+    rows_a: tuple[int, ...]  # of world.shapes, for each body
+    rows_b: tuple[int, ...]  # for each body, or each static
+    b: tuple[int, ...]  # colliders: the bodies, or the statics
+    allowed: tuple[tuple[float, ...], ...]  # (N, N or B): 1 if these two can meet, else 0
+
+
+class Slots(NamedTuple):
+    """E impacts of each world, or fewer, as weights 0 or 1; at most one in all rows of a slot."""
+
+    a: Array  # (E, N, *batch) body a
+    b: tuple[Array, ...]  # for each table (E, N or B, *batch) the other side; all 0 if the slot is not of its kind
 
 
 def is_crowded(world: Any) -> bool:
-    """Whether a world is crowded with round shapes, whose impact times have a closed form. Static."""
+    """Whether all bodies are discs, or spheres, whose impact times have a closed form, in many pairs. Static."""
     moving, count = len(world.names), sum(len(pairs.a) for pairs in world.pairs)
+    bodies = [(kind, owner) for kind, owners in enumerate(world.owners) for owner in owners if owner < moving]
 
     def solved(pairs: PairGroup) -> bool:
         straight = relative_path_is_straight(world, max(pairs.a + pairs.b) < moving)
         return closed_form(world.shapes[pairs.shape_a], world.shapes[pairs.shape_b], straight)
 
-    return count > CROWDED * moving and all(map(solved, world.pairs))
+    one_disc_each = len({kind for kind, _ in bodies}) == 1 and sorted(o for _, o in bodies) == list(range(moving))
+    return count > CROWDED * moving and one_disc_each and all(map(solved, world.pairs))
 
 
-def grid_of(pairs: PairGroup) -> Grid:
-    """The table that holds the pairs of a group."""
-    row_of_a = dict(sorted(zip(pairs.a, pairs.row_a, strict=True)))
-    row_of_b = dict(sorted(zip(pairs.b, pairs.row_b, strict=True)))
-    there = set(zip(pairs.a, pairs.b, strict=True))
-    allowed = tuple(tuple(float((i, j) in there) for j in row_of_b) for i in row_of_a)
-    rows_a, rows_b = tuple(row_of_a.values()), tuple(row_of_b.values())
-    return Grid(pairs, rows_a, rows_b, tuple(row_of_a), tuple(row_of_b), allowed)
+def tables_of(world: Any) -> tuple[Table, ...]:
+    """The tables that hold all pairs of a crowded world."""
+    moving = len(world.names)
+
+    def table(pairs: PairGroup) -> Table:
+        row_of = {owner: row for row, owner in enumerate(world.owners[pairs.shape_a])}
+        row_of_b = {owner: row for row, owner in enumerate(world.owners[pairs.shape_b])}
+        bodies = tuple(range(moving))
+        b = bodies if max(pairs.b) < moving else tuple(sorted(set(pairs.b)))
+        there = set(zip(pairs.a, pairs.b, strict=True)) | set(zip(pairs.b, pairs.a, strict=True))
+        allowed = tuple(tuple(float((i, j) in there) for j in b) for i in bodies)
+        return Table(pairs, tuple(row_of[i] for i in bodies), tuple(row_of_b[j] for j in b), b, allowed)
+
+    return tuple(map(table, world.pairs))
 
 
-def partners(world: Any, grids: tuple[Grid, ...], flight: Flight, since: Array, dt: Array):
-    """Which pairs have an impact that is the next one of both bodies.
+def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: Array, dt: Array):
+    """The impacts of this step that are the next one of both bodies.
 
     Returns:
-        for each grid (A, B, *batch) 1 for these pairs, else 0; whether they are isolated, exact and none rests,
-        a bool; whether there are any, a bool.
+        slots; whether they hold all of these impacts and all are isolated, exact and do not rest, a bool; whether
+        there are any, a bool.
     """
-    moving, tie = len(world.names), jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt
-    live = jnp.any(dt > 0)
-    times = fence(live, [_next_times(world, grid, flight, since, dt) for grid in grids])
-    first = jnp.full((moving, *times[0].shape[2:]), jnp.inf, dt.dtype)
-    for grid, s in zip(grids, times, strict=True):
-        first = jnp.minimum(first, _at_bodies(_fold(jnp.minimum, s, 1), grid.a, moving, jnp.inf))
-        first = jnp.minimum(first, _at_bodies(_fold(jnp.minimum, s, 0), grid.b, moving, jnp.inf))
-    first = fence(live, first)
-    isolated = jnp.all(first > RESTS) & ~jnp.any(world.contact.width > 0)
-    nows, count = [], jnp.zeros_like(first)
-    for grid, s in zip(grids, times, strict=True):
-        earliest = rows(first, grid.a)[:, None]
-        if min(grid.b) < moving:
-            earliest = jnp.minimum(earliest, rows(first, grid.b)[None])
-        nows.append((s - earliest <= tie[None, None]).astype(dt.dtype))  # inf - inf is not
-    for grid, now in zip(grids, nows, strict=True):
-        count = count + _at_bodies(_fold(jnp.add, now, 1), grid.a, moving, 0.0)
-        count = count + _at_bodies(_fold(jnp.add, now, 0), grid.b, moving, 0.0)
-    return nows, isolated & jnp.all(count <= 1), jnp.any(count > 0)
+    moving, live = len(world.names), jnp.any(dt > 0)
+    tie = (jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt)[None]
+
+    def of_bodies(soonest):
+        first = later = jnp.full_like(soonest[0][0], jnp.inf)
+        for least, following, _ in soonest:
+            later = jnp.minimum(jnp.maximum(first, least), jnp.minimum(later, following))
+            first = jnp.minimum(first, least)
+        first = jnp.where(first <= dt[None], first, jnp.inf)
+        return first, jnp.all((first == jnp.inf) | ((later > first + tie) & (first > RESTS)))
+
+    # Apart: times are compared with each other below, and must not be computed twice with another rounding.
+    soonest = [_soonest(live, world, table, flight, since, dt) for table in tables]
+    first, alone = apart(live, of_bodies, soonest)
+    s = apart(live, functools.partial(_in_order, count=-(-moving // SHARE)), first)
+    slots, ties = _slots(live, moving, tables, soonest, first, s, tie)
+    too_many = jnp.any((first > s[-1][None]) & (first < jnp.inf))
+    isolated = alone & ~too_many & ~ties & ~jnp.any(world.contact.width > 0)
+    return slots, isolated, jnp.any(s[0] < jnp.inf)
 
 
-def _next_times(world: Any, grid: Grid, flight: Flight, since: Array, dt: Array) -> Array:
-    """Time of the next impact of every pair, (A, B, *batch) [s]; inf: none in this step; RESTS: no rebound."""
-    straight = relative_path_is_straight(world, max(grid.a + grid.b) < len(world.names))
-    rest_speed = world.contact.rest_speed
+def _soonest(live: Array, world: Any, table: Table, flight: Flight, since: Array, dt: Array) -> tuple:
+    """Times of the next impacts with one side of a table [s]; inf: none in this step; RESTS: without rebound.
 
-    def one(a: Side, b: Side, allowed: Array, e_a: Material, e_b: Material) -> Array:
-        s, _, found, u = approach(a, b, dt, None, straight)
-        rests = u <= rest_speed
-        if isinstance(b.shape, HalfSpace):  # seen from the other, the path of any other pair is straight
-            n = rotations(b.x.shape[0]).rotate(b.q, b.shape.normal)
-            rests = rests | (2.0 * mixed(e_a, e_b) * u <= -dot(n, a.flight.a) * (dt - s))
-        return jnp.where(found & (s <= dt) & (allowed > 0), jnp.where(rests, RESTS, s), jnp.inf)
-
-    a, b = _sides(world, grid, flight, since)
-    own, others = (material(world, "restitution", colliders) for colliders in (grid.a, grid.b))
-    return jax.vmap(jax.vmap(one, (None, 0, 0, None, 0)), (0, None, 0, 0, None))(a, b, _table(grid, dt), own, others)
+    Returns:
+        (N, *batch) of each body the first and, against statics, the second; (B, *batch) of each static the first.
+    """
+    a, b = _sides(world, table, flight, since)
+    if table.b[0] < a.flight.t0.shape[0]:
+        times = apart(live, functools.partial(_times_of_pairs, world, table), a, since, dt)
+        least = apart(live, functools.partial(_fold, jnp.minimum, axis=1), times)
+        return least, jnp.full_like(least, jnp.inf), None
+    times = apart(live, functools.partial(_times_to_statics, world, table), a, b, dt)
+    return *apart(live, _two_smallest, times), apart(live, functools.partial(_fold, jnp.minimum, axis=0), times)
 
 
-class Blows(NamedTuple):
-    """What the impacts of a pass do to each body."""
+def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Array) -> Array:
+    """Time of the next impact of each body with each other, (N, N, *batch) [s]: `meet_on_line`, without derivative."""
+    zero = jnp.zeros_like(bodies.flight.t0)
+    x, v = jax.vmap(position)(bodies.flight, zero), jax.vmap(velocity)(bodies.flight, zero)
 
-    hits: Array  # (N, *batch) 0 or 1
-    s: Array  # (N, *batch) [s] sum of their times
-    P: Array  # (N, D, *batch) [N s] sum of impulses
-    turn: Array  # (N, A, *batch) [N m s] sum of r x P
+    def one(a: tuple, b: tuple) -> Array:
+        (x_a, v_a, t_a, since_a, radius_a), (x_b, v_b, t_b, since_b, radius_b) = a, b
+        P, W, R, start = x_a - x_b, v_a - v_b, radius_a + radius_b, jnp.maximum(t_a, t_b)
+        W2, PW, excess = dot(W, W), dot(P, W), dot(P, P) - R * R
+        D = PW * PW - W2 * excess
+        root = safe_sqrt(D)
+        closing = (D > 0) & (PW + start * W2 < 0)  # 0 for a body and itself
+        s = jnp.where(closing, excess / (root - PW), jnp.inf)
+        s = jnp.where(s < jnp.maximum(since_a, since_b), start, s)
+        rests = (root <= world.contact.rest_speed * R) & (s <= dt)
+        return jnp.where(rests, RESTS, s)
 
-
-def meet(world: Any, grids: tuple[Grid, ...], nows: list[Array], flight: Flight, since: Array, dt: Array) -> Blows:
-    """Impacts of bodies with the one partner that each has now."""
-    moving, so, live = len(world.names), rotations(flight.dim), jnp.any(dt > 0)
-    parts = []
-    for grid, now in zip(grids, nows, strict=True):
-        a, b = _sides(world, grid, flight, since)
-        own, others = ([material(world, name, colliders) for name in MATERIALS] for colliders in (grid.a, grid.b))
-        partner, others = _pick(live, now, (b, others))
-        e, mu = map(mixed, own, others)
-        strikes = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, partner)
-        k = fence(live, jax.tree.map(lambda leaf: leaf[:, 0], replace(strikes, gap=None, push=None, drift=None)))
-        on = _fold(jnp.add, now, 1) * k.active.astype(now.dtype)
-        target = -e * jax.vmap(dot)(k.normal, k.v_rel)
-        P = jnp.where(on[:, None] > 0, jax.vmap(contact_law)(k.K, k.normal, k.v_rel, target, mu), 0.0)
-        blows = Blows(on, on * k.s, P, jax.vmap(so.moment)(k.arm_a, P))
-        blows, minus = fence(live, (blows, Blows(on, on * k.s, -P, jax.vmap(so.moment)(k.arm_b, -P))))
-        parts.append(Blows(*(_at_bodies(value, grid.a, moving, 0.0) for value in blows)))
-        if min(grid.b) < moving:
-            blows = packed_map(functools.partial(_across, live, now), minus, now.ndim - 2)
-            parts.append(Blows(*(_at_bodies(value, grid.b, moving, 0.0) for value in blows)))
-    return jax.tree.map(lambda *values: sum(values), *parts)
+    lines = (x, v, bodies.flight.t0, since, bodies.shape.radius)
+    return _allowed(table, jax.vmap(jax.vmap(one, (None, 0)), (0, None))(lines, lines))
 
 
-def _across(live: Array, now: Array, values: Array) -> Array:
-    """From the rows of side a, (A, F, *batch), to those of side b which they meet."""
-    return fence(live, _weighted_sum(now, values, 0))
+def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
+    """Time of the next impact of each body with each static, (N, B, *batch) [s]."""
+    if isinstance(b.shape, HalfSpace):
+        times = _times_to_planes(world, table, a, b, dt)
+    else:
+
+        def one(a: Side, b: Side) -> Array:
+            s, _, found, u = approach(a, b, dt, None, True)
+            return jnp.where(found, jnp.where((u <= world.contact.rest_speed) & (s <= dt), RESTS, s), jnp.inf)
+
+        times = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(a, b)
+    return _allowed(table, times)
+
+
+def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
+    so, live, f = rotations(a.flight.dim), jnp.any(dt > 0), a.flight
+    own, others = (material(world, "restitution", of) for of in (tuple(range(len(world.names))), table.b))
+
+    def planes(b: Side, own: Material, others: Material) -> tuple:
+        n = jax.vmap(so.rotate)(b.q, b.shape.normal)
+        e = jax.vmap(jax.vmap(mixed, (None, 0)), (0, None))(own, others)
+        return n, jax.vmap(dot)(n, b.x) + b.shape.offset, 2.0 * e
+
+    def one(body: tuple, plane: tuple, twice_e: Array) -> Array:
+        (x, v, acc, t0, since, radius), (n, offset) = body, plane
+        acc = dot(n, acc)
+        s, _, found, u, sunk = meet_on_parabola(dot(n, x) - offset - radius, dot(n, v), acc, None)
+        s = jnp.where(sunk | (t0 + s < since), t0, t0 + s)
+        rests = (u <= world.contact.rest_speed) | (twice_e * u <= -acc * (dt - s))
+        return jnp.where(found, jnp.where(rests & (s <= dt), RESTS, s), jnp.inf)
+
+    n, offset, twice_e = apart(live, planes, b, own, others)
+    bodies = (f.x, f.v, f.a, f.t0, a.since, a.shape.radius)
+    return jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, 0))(bodies, (n, offset), twice_e)
+
+
+def _allowed(table: Table, times: Array) -> Array:
+    """The times (N, B, *batch), inf where the two cannot meet."""
+    pairs = ((i, j, allowed) for i, row in enumerate(table.allowed) for j, allowed in zip(table.b, row, strict=True))
+    if all(allowed or i == j for i, j, allowed in pairs):
+        return times
+    allowed = constant(table.allowed, str(times.dtype))
+    return jnp.where(lax.expand_dims(allowed, range(2, times.ndim)) > 0, times, jnp.inf)
+
+
+def _slots(live: Array, moving: int, tables: tuple, soonest: list, first: Array, s: Array, tie: Array):
+    """The impacts at the times s (E, *batch), as slots, and whether two share a body or cannot be told apart."""
+
+    def taking_part(soonest, first, s):
+        """(E, N, *batch) for each table: 1 for bodies whose next impact is then and of this kind; how many."""
+        now = (first[None] == s[:, None]) & (s < jnp.inf)[:, None]
+        return [(now & (least[None] == s[:, None])).astype(s.dtype) for least, *_ in soonest]
+
+    bodies = apart(live, taking_part, soonest, first, s)
+    counts = apart(live, lambda bodies: [_sum(now) for now in bodies], bodies)
+    total, void = sum(counts), jnp.zeros_like(s, bool)
+    fine = total == 0
+    for table, n in zip(tables, counts, strict=True):
+        both = table.b[0] < moving
+        void = void | (n == 1) if both else void
+        fine = fine | ((n == total) & ((n <= 2) if both else (n == 1)))
+    near = (s[1:] - s[:-1] <= tie) & (void[1:] | void[:-1])  # inf - inf is not
+
+    def lowest(now, n):
+        number = lax.broadcasted_iota(s.dtype, now.shape, 1)
+        return jnp.where(n == 2, _fold(jnp.minimum, jnp.where(now > 0, number, moving), 1), moving)
+
+    def weights(soonest, bodies, counts, lowest, s):
+        of_a, of_b = 0.0, []
+        for table, now, n, k, (_, _, column) in zip(tables, bodies, counts, lowest, soonest, strict=True):
+            if table.b[0] < moving:
+                a = (lax.broadcasted_iota(s.dtype, now.shape, 1) == k[:, None]).astype(s.dtype)
+                of_b.append(jnp.where((n == 2)[:, None], now - a, 0.0))
+            else:
+                a = now
+                of_b.append((column[None] == s[:, None]).astype(s.dtype) * n[:, None])
+            of_a = of_a + a
+        return Slots(of_a, tuple(of_b))
+
+    firsts = [
+        apart(live, lowest, now, n) if table.b[0] < moving else None
+        for table, now, n in zip(tables, bodies, counts, strict=True)
+    ]
+    return apart(live, weights, soonest, bodies, counts, firsts, s), ~jnp.all(fine) | jnp.any(near)
+
+
+class Blow(NamedTuple):
+    """The impact in each slot."""
+
+    on: Array  # (E, *batch) 1 or 0
+    strike: Strikes  # (E, ...)
+    e: Array  # (E, *batch) [-]
+    mu: Array  # (E, *batch) [-]
+
+
+def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, launch: Any, dt: Array) -> Anchors:
+    """The anchors after the impacts in the slots."""
+    flight, so, live = launch(anchors.state, anchors.t0), rotations(world.dim), jnp.any(dt > 0)
+    moving, count = len(world.names), slots.a.shape[0]
+    movers = [b for table, b in zip(tables, slots.b, strict=True) if table.b[0] < moving]
+    weights = jnp.concatenate([slots.a, *movers])  # a of all slots, then b of all slots
+    body, _ = _sides(world, tables[0], flight, anchors.since)
+    columns, unpack = pack((body, _materials(world, tuple(range(moving)))), dt.ndim)
+    columns = _pick(live, weights, columns)
+    columns_a, columns_b = [c[:count] for c in columns], [c[count:] for c in columns]
+
+    def blow(unpack_b: Callable, columns_a: list, columns_b: list, there: Array) -> Blow:
+        (a, own), (b, others) = unpack(columns_a), unpack_b(columns_b)
+        strike = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, b)
+        strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, push=None, drift=None))
+        return Blow(_sum(there) * strike.active.astype(dt.dtype), strike, *map(mixed, own, others))
+
+    def impulse(blows: list[Blow]) -> tuple:
+        one, *others = blows
+        for other in others:
+            one = jax.tree.map(functools.partial(_where, other.on > 0), other, one)
+        on, k, e, mu = one
+        P = impulses(on > 0, k.K, k.normal, k.v_rel, -e * jax.vmap(dot)(k.normal, k.v_rel), mu)
+        return on, k.s, P, k.arm_a, k.arm_b
+
+    def end(columns: list, t: Array, P: Array, arm: Array) -> tuple:
+        f = unpack(columns)[0].flight
+        q = jax.vmap(orientation)(f, t)
+        return jax.vmap(struck)(f, t, q, f.inverse_mass[:, None] * P, jax.vmap(so.moment)(arm, P)), t
+
+    def put(weights: Array, columns: list) -> list:
+        return [_weighted_sum(weights, column, 0) for column in columns]
+
+    blows = []
+    for table, there in zip(tables, slots.b, strict=True):
+        if table.b[0] < moving:
+            blows.append(apart(live, functools.partial(blow, unpack), columns_a, columns_b, there))
+        else:
+            static, unpack_static = pack(_static(world, table, flight, anchors.since), dt.ndim)
+            static = _pick(live, there, static)
+            blows.append(apart(live, functools.partial(blow, unpack_static), columns_a, static, there))
+    on, t, P, arm_a, arm_b = apart(live, impulse, blows)
+    if movers:
+        on, t, P, arm = (jnp.concatenate(pair) for pair in ((on, on), (t, t), (P, -P), (arm_a, arm_b)))
+    else:
+        arm = arm_a
+    after, unpack_after = pack(apart(live, end, columns, t, P, arm), dt.ndim)
+    weights = apart(live, lambda weights, on: weights * on[:, None], weights, on)
+    state, t = unpack_after(apart(live, put, weights, after))
+    hit = _fold(jnp.add, weights, 0) > 0
+    old = (anchors.state, anchors.t0, anchors.since)
+    state, t0, since = jax.tree.map(functools.partial(_where, hit), (state, t, t), old)
+    return Anchors(state=state, t0=t0, since=since)
+
+
+def _static(world: Any, table: Table, flight: Flight, since: Array) -> tuple:
+    """The statics of a table, and their materials."""
+    return _sides(world, table, flight, since)[1], _materials(world, table.b)
+
+
+def _materials(world: Any, colliders: tuple[int, ...]) -> list[Material]:
+    return [material(world, name, colliders) for name in MATERIALS]
+
+
+def _sides(world: Any, table: Table, flight: Flight, since: Array) -> tuple[Side, Side]:
+    a = side_of(world, flight, since, table.pairs.shape_a, table.rows_a, tuple(range(len(table.rows_a))))
+    return a, side_of(world, flight, since, table.pairs.shape_b, table.rows_b, table.b)
+
+
+def _where(chosen: Array, new: Array, old: Array) -> Array:
+    """Choice by the leading axis and the batch: (M, *batch), (M, ..., *batch)."""
+    return jnp.where(lax.expand_dims(chosen, range(1, 1 + new.ndim - chosen.ndim)), new, old)
+
+
+def _in_order(first: Array, count: int) -> Array:
+    """The `count` least different values of (N, *batch) over the bodies, ascending; inf where there are fewer."""
+
+    def following(s, _):
+        s = _fold(jnp.minimum, jnp.where(first > s[None], first, jnp.inf), 0)
+        return s, s
+
+    return lax.scan(following, jnp.full_like(first[0], -jnp.inf), None, length=count)[1]
+
+
+def _two_smallest(table: Array) -> tuple[Array, Array]:
+    """The smallest and the next of each row of a table (A, B, *batch)."""
+    least, following = table[:, 0], jnp.full_like(table[:, 0], jnp.inf)
+    for k in range(1, table.shape[1]):
+        least, following = jnp.minimum(least, table[:, k]), jnp.minimum(following, jnp.maximum(least, table[:, k]))
+    return least, following
+
+
+def _sum(weights: Array) -> Array:
+    """(E, A, *batch) to (E, *batch)."""
+    return _fold(jnp.add, weights, 1)
 
 
 def _fold(op: Any, table: Array, axis: int) -> Array:
-    """Reduction over the bodies on one axis of a table (A, B, *batch). Written out: XLA's own is slow."""
+    """Reduction over one axis in front of the batch. Written out: XLA's own is slow."""
     return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
 
 
-def _sides(world: Any, grid: Grid, flight: Flight, since: Array) -> tuple[Side, Side]:
-    a = side_of(world, flight, since, grid.pairs.shape_a, grid.rows_a, grid.a)
-    return a, side_of(world, flight, since, grid.pairs.shape_b, grid.rows_b, grid.b)
+def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
+    """Of A rows, for each of E slots that one of weight 1 (E, A, *batch); the first where there is none."""
 
+    def filled(weights, total):
+        first = lax.broadcasted_iota(weights.dtype, weights.shape, 1) == 0
+        return jnp.where(first, weights + (1.0 - total)[:, None], weights)
 
-def _pick(live: Array, now: Array, sides: Any) -> Any:
-    """Of B sides, for each of A rows that one with which it is now (A, B, *batch); the first where there is none."""
-    none = (1.0 - _fold(jnp.add, now, 1))[:, None]
+    def pick(weights, columns):
+        return [_weighted_sum(weights, column, 1) for column in columns]
 
-    def pick(values):
-        return fence(live, none * values[None, 0] + _weighted_sum(now, values, 1))
-
-    return packed_map(pick, sides, now.ndim - 2)
+    weights = apart(live, filled, weights, apart(live, _sum, weights))
+    return apart(live, pick, weights, columns)
 
 
 def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
@@ -194,20 +384,3 @@ def _sum_of_terms(weights: Array, values: Array, axis: int) -> Array:
 
     count, zero = values.shape[0], jnp.zeros((weights.shape[1 - axis], *values.shape[1:]), values.dtype)
     return lax.scan(add, zero, (jnp.arange(count), values), unroll=min(count, 16))[0]
-
-
-def _at_bodies(values: Array, colliders: tuple[int, ...], moving: int, fill: float) -> Array:
-    """Values of some colliders, in ascending order, as values of all N moving bodies."""
-    if min(colliders) >= moving:
-        return jnp.full((moving, *values.shape[1:]), fill, values.dtype)
-    if colliders == tuple(range(colliders[0], colliders[-1] + 1)):
-        widths = [(colliders[0], moving - 1 - colliders[-1]), *[(0, 0)] * (values.ndim - 1)]
-        return jnp.pad(values, widths, constant_values=fill)
-    row = {collider: k for k, collider in enumerate(colliders)}
-    padded = jnp.concatenate([values, jnp.full_like(values[:1], fill)])
-    return rows(padded, tuple(row.get(body, len(colliders)) for body in range(moving)))
-
-
-def _table(grid: Grid, like: Array) -> Array:
-    table = constant(grid.allowed, str(like.dtype))
-    return lax.expand_dims(table, range(2, 2 + like.ndim))

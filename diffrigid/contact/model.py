@@ -22,11 +22,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.contact.isolated import grid_of, is_crowded, meet, partners
+from diffrigid.contact.anchors import Anchors, struck
+from diffrigid.contact.isolated import is_crowded, meet, next_impacts, tables_of
 from diffrigid.contact.resting import Mobility, Strikes, momentum_changes, solve_impulses, velocities
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
 from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
-from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
+from diffrigid.flight import Flight, orientation, state_at
 from diffrigid.numerics import dot, rows
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
@@ -68,7 +69,7 @@ class Contact:
         end = self._passes(world, start, launch, dt, near)
         return state_at(launch(end.state, end.t0), dt)
 
-    def _passes(self, world: Any, start: "Anchors", launch: Callable, dt: Array, near: Array) -> "Anchors":
+    def _passes(self, world: Any, start: Anchors, launch: Callable, dt: Array, near: Array) -> Anchors:
         """The anchors after all passes; there are none unless some pair is `near`, a bool."""
         contacts = sum(len(pairs.a) * pairs.count for pairs in world.pairs)
         resting = jnp.zeros((contacts, *start.t0.shape[1:]), bool)
@@ -78,18 +79,18 @@ class Contact:
             del found, rests
             return _pass(world, anchors, launch, resting, dt, phase)
 
-        grids = tuple(grid_of(pairs) for pairs in world.pairs) if is_crowded(world) else ()
+        tables = tables_of(world) if is_crowded(world) else ()
 
         @jax.checkpoint
-        def meet_partners(anchors, nows):
-            return _meet_partners(world, grids, anchors, launch, nows, dt)
+        def meet_in_slots(anchors, slots):
+            return meet(world, tables, slots, anchors, launch, dt)
 
         def isolated_or_any(anchors, resting, found, rests, phase):
             flight = lax.stop_gradient(launch(anchors.state, anchors.t0))
-            nows, isolated, found = partners(world, grids, flight, anchors.since, dt)
+            slots, isolated, found = next_impacts(world, tables, flight, anchors.since, dt)
 
             def isolated_pass():
-                met = lax.cond(found, meet_partners, lambda anchors, _: anchors, anchors, nows)
+                met = lax.cond(found, meet_in_slots, lambda anchors, _: anchors, anchors, slots)
                 return met, resting, found, rests
 
             def any_pass():
@@ -100,21 +101,12 @@ class Contact:
         def maybe(carry, phase):
             *_, found, rests = carry
             needed = jnp.where(phase == IMPACT, found, rests)
-            some_pass = isolated_or_any if grids else one_pass
+            some_pass = isolated_or_any if tables else one_pass
             return lax.cond(needed, lambda c: some_pass(*c, phase), lambda c: c, carry), None
 
         phases = jnp.array([IMPACT] * self.sweeps + [HOLD, PUSH])
         (end, *_), _ = lax.scan(maybe, (start, resting, near, jnp.asarray(False)), phases)
         return end
-
-
-@pytree
-class Anchors:
-    """Every body at its own time, the start of the step or its latest impact."""
-
-    state: State
-    t0: Leaf = array("N")  # [s]
-    since: Leaf = array("N")  # [s] earliest time for which the path from here holds; before 0: late impacts
 
 
 def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Array, phase: Array):
@@ -185,17 +177,6 @@ def _apply(anchors: Anchors, flight: Flight, strikes: Strikes, target, mu, kick:
     return _anchored(anchors, flight, t, q, count > 0, (kick * dv, kick * dL + (1.0 - kick) * kept), moved)
 
 
-def _meet_partners(world: Any, grids: tuple, anchors: Anchors, launch: Callable, nows, dt: Array) -> Anchors:
-    """The anchors after impacts of bodies that have one partner each."""
-    flight = launch(anchors.state, anchors.t0)
-    blows = meet(world, grids, nows, flight, anchors.since, dt)
-    hit = blows.hits > 0
-    t = jnp.where(hit, blows.s, flight.t0)
-    q, still = jax.vmap(orientation)(flight, t), jnp.zeros_like(blows.turn)
-    kicked = flight.inverse_mass[:, None] * blows.P, blows.turn
-    return _anchored(anchors, flight, t, q, hit, kicked, (jnp.zeros_like(blows.P), still))
-
-
 def _posed(flight: Flight, t: Array) -> tuple[Array, Mobility]:
     """Orientations of all bodies, each at its own time t (N, *batch), and their mobility there."""
     q = jax.vmap(orientation)(flight, t)
@@ -214,10 +195,9 @@ def _anchored(anchors: Anchors, flight: Flight, t, q, hit, kicked, moved) -> Anc
     """
     so = rotations(flight.dim)
 
-    def struck(f: Flight, t: Array, q: Array, dv: Array, dL: Array, dx: Array, turn: Array) -> State:
-        q = so.turn_by(turn, q)
-        w = so.unspin(f.inverse_inertia, q, angular_momentum(f, t) + dL)
-        return State(x=position(f, t) + dx, q=q, v=velocity(f, t) + dv, w=w)
+    def one(f: Flight, t: Array, q: Array, dv: Array, dL: Array, dx: Array, turn: Array) -> State:
+        after = struck(f, t, so.turn_by(turn, q), dv, dL)
+        return replace(after, x=after.x + dx)
 
-    state = jax.vmap(struck)(flight, t, q, *kicked, *moved)
+    state = jax.vmap(one)(flight, t, q, *kicked, *moved)
     return Anchors(state=state, t0=t, since=jnp.where(hit, t, anchors.since))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.contact.impulse import contact_law, times
+from diffrigid.contact.impulse import impulses, times
 from diffrigid.contact.sides import at_colliders, side_sum
 from diffrigid.numerics import safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static
@@ -115,8 +115,7 @@ class Law:
 
 
 def _apply_law(law: Law, v: Array) -> Array:
-    solved = jax.vmap(contact_law)(law.K, law.normal, v, law.target, law.mu)
-    return jnp.where(law.on[:, None] > 0, solved, 0.0)
+    return impulses(law.on > 0, law.K, law.normal, v, law.target, law.mu)
 
 
 def _others(law: Law, P: Array, arms: Arms, mobility: Mobility) -> Array:

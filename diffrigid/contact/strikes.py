@@ -13,7 +13,7 @@ from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
-from diffrigid.numerics import constant, dot, fence, norm, rows
+from diffrigid.numerics import apart, constant, dot, norm, rows
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
@@ -26,8 +26,8 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     """
     width, parts = world.contact.width, []
     for pairs in world.pairs:
-        part = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, at_end, width))(*sides_of(world, pairs, flight, since))
-        part = fence(jnp.any(dt > 0), part)
+        each = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, at_end, width))
+        part = apart(jnp.any(dt > 0), each, *sides_of(world, pairs, flight, since))
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if len(parts) > 1:
         strikes = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)

@@ -1,0 +1,22 @@
+"""Where and when the paths of the bodies begin: at the start of the step, or at their latest impact."""
+
+from jax import Array
+
+from diffrigid.flight import Flight, angular_momentum, position, velocity
+from diffrigid.pytree import Leaf, array, pytree
+from diffrigid.state import State, rotations
+
+
+@pytree
+class Anchors:
+    """Every body at its own time, the start of the step or its latest impact."""
+
+    state: State
+    t0: Leaf = array("N")  # [s]
+    since: Leaf = array("N")  # [s] earliest time for which the path from here holds; before 0: late impacts
+
+
+def struck(f: Flight, t: Array, q: Array, dv: Array, dL: Array) -> State:
+    """A body at time t (*batch) [s] of its path, where it is turned to q and gets dv [m/s] and dL [kg m^2/s]."""
+    w = rotations(f.dim).unspin(f.inverse_inertia, q, angular_momentum(f, t) + dL)
+    return State(x=position(f, t), q=q, v=velocity(f, t) + dv, w=w)
