@@ -7,6 +7,7 @@ S statics, C contacts, P pairs, K contacts of a pair, T time steps; trailing bat
 from diffrigid.batch import rollout_batch
 from diffrigid.contact import Contact
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
+from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.pytree import replace
 from diffrigid.scene import Body, Static, scene
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Sphere
@@ -24,11 +25,13 @@ from diffrigid.sysid import Fit, fit, interval, positive, real
 from diffrigid.world import World, check
 
 __all__ = [
+    "Ball",
     "Body",
     "Box",
     "Capsule",
     "Contact",
     "Disc",
+    "Distance",
     "Drag",
     "Fit",
     "Force",
@@ -36,12 +39,15 @@ __all__ = [
     "HalfSpace",
     "Hull",
     "Polygon",
+    "Prismatic",
+    "Revolute",
     "Sphere",
     "SpringDamper",
     "State",
     "Static",
     "Torque",
     "Trajectory",
+    "Weld",
     "World",
     "Wrench",
     "angular_momentum",

@@ -1,26 +1,29 @@
 """The free motion of bodies within a step, as functions of the time s since its start.
 
 A `Flight` anchors every body at its own time t0, the start of the step or its latest impact, and says where it
-goes from there:
+goes from there, with t = s - t0 and T its whole duration:
 
-    x(s) = x + v (s - t0) + a (s - t0)^2 / 2                       exact under a constant force
-    v(s) = v + a (s - t0) + jolt (s - t0)^2 / 2                    jolt: (a at the end - a at the anchor) / T
-    L(s) = L + tau (s - t0) + twist (s - t0)^2 / 2                 world axes; L is kept, not w (3D: w wanders)
-    q(s) = q o exp(sum_k turn[k] (s - t0)^(k+1))                   exponential map; see turn_series
+    x(s) = x + v t + a t^2 / 2 + jerk t^3 / 6        exact under a constant force
+    v(s) = v + a t + jolt t^2 / 2
+    L(s) = L + tau t + twist t^2 / 2                 world axes; L is kept, not w (3D: w wanders)
+    q(s) = q o exp(sum_k turn[k] t^(k+1))            exponential map
 
-With forces that vary this is the velocity Verlet rule (Swope et al. 1982), second order and, where forces
-depend on position alone, symplectic.
+A constant force has none of jerk, jolt and twist, and `turn_series` for the rotation. Forces that vary, and those
+of joints, are integrated by the classical rule of Runge and Kutta, in the rotation vector for the orientation
+(Munthe-Kaas 1998): fourth order. Then jerk, jolt, twist and turn are those of the curves that end where it ends.
 """
 
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.forces import is_constant, total_wrench
+from diffrigid.joints import joint_wrench
 from diffrigid.numerics import safe_divide
 from diffrigid.pytree import array, pytree, replace, static
-from diffrigid.state import Bodies, State, rotations, spin
+from diffrigid.state import State, Wrench, rotations, spin
 
 
 @pytree
@@ -34,7 +37,8 @@ class Flight:
     L: Array = array("N", "A")
     a: Array = array("N", "D")  # [m/s^2] at the anchor
     tau: Array | None = array("N", "A", default=None)  # [N m] at the anchor; None: no torques in this world
-    jolt: Array | None = array("N", "D", default=None)  # [m/s^3]; None: constant forces
+    jerk: Array | None = array("N", "D", default=None)  # [m/s^3]; None: constant forces
+    jolt: Array | None = array("N", "D", default=None)  # [m/s^3]
     twist: Array | None = array("N", "A", default=None)  # [N m/s]
     turn: Array = array("N", "K", "A")  # [rad/s, rad/s^2, ...]
     inverse_mass: Array = array("N")  # [1/kg]
@@ -42,31 +46,99 @@ class Flight:
     dim: int = static()
 
 
-def launch(forces: tuple, bodies: Bodies, state: State, controls: Any, t0: Array, t1: Array) -> Flight:
+def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Flight:
     """Free motion of all bodies from `state`, each at its own time t0 (N, *batch), to t1 (*batch) [s]."""
+    bodies = world.bodies
     so = rotations(bodies.dim)
-    wrench = total_wrench(forces, bodies, state, controls)
+    wrench = _wrench(world, state, controls)
     inverse = jax.vmap(so.inverse_inertia)(bodies.inertia)
     L = spin(bodies, state)
-    turn = jax.vmap(so.turn_series)(inverse, state.q, L, wrench.tau)
     flight = Flight(
-        t0=t0, x=state.x, q=state.q, v=state.v, L=L, a=wrench.F / bodies.mass[:, None],
-        tau=wrench.tau, turn=turn, inverse_mass=1.0 / bodies.mass, inverse_inertia=inverse, dim=bodies.dim,
+        t0=t0, x=state.x, q=state.q, v=state.v, L=L, a=wrench.F / bodies.mass[:, None], tau=wrench.tau,
+        turn=jax.vmap(so.turn_series)(inverse, state.q, L, wrench.tau), inverse_mass=1.0 / bodies.mass,
+        inverse_inertia=inverse, dim=bodies.dim,
     )  # fmt: skip
-    if is_constant(forces):
+    if is_constant(world.forces) and not world.joints:
         return flight
-    end = total_wrench(forces, bodies, state_at(flight, t1), controls)
-    duration = (t1[None] - t0)[:, None]
-    jolt = safe_divide(end.F - wrench.F, duration) / bodies.mass[:, None]
-    turned = wrench.tau is not None and end.tau is not None
-    twist = safe_divide(end.tau - wrench.tau, duration) if turned else None  # type: ignore[operator]
-    return replace(flight, jolt=jolt, twist=twist)
+    return _through_end(flight, _runge_kutta(world, flight, controls, t1[None] - t0), t1[None] - t0)
+
+
+def _wrench(world: Any, state: State, controls: Any) -> Wrench:
+    """All forces on free bodies, and those of the joints."""
+    wrench = total_wrench(world.forces, world.bodies, state, controls)
+    return joint_wrench(world.joints, world.statics, world.bodies, state, wrench) if world.joints else wrench
+
+
+@pytree
+class Motion:
+    """Position, rotation vector since the anchor (body axes), velocity, angular momentum; or their rates."""
+
+    x: Array = array("N", "D")
+    phi: Array = array("N", "A")
+    v: Array = array("N", "D")
+    L: Array = array("N", "A")
+
+
+def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion, Motion]:
+    """The motion after T (N, *batch) [s], and its rates then, of which those of v and L are not at hand but 0."""
+    so = rotations(f.dim)
+
+    def placed(motion):
+        q = jax.vmap(lambda q, phi: so.compose(q, so.exp(phi)))(f.q, motion.phi)
+        w = jax.vmap(so.unspin)(f.inverse_inertia, q, motion.L)
+        return State(x=motion.x, q=q, v=motion.v, w=w)
+
+    def turning(motion, state):
+        return jax.vmap(lambda q, phi, w: so.turn_rate(phi, so.unrotate(q, w) if so.D == 3 else w))(
+            state.q, motion.phi, state.w
+        )
+
+    def rates(motion):
+        state = placed(motion)
+        wrench = _wrench(world, state, controls)
+        tau = jnp.zeros_like(motion.L) if wrench.tau is None else wrench.tau
+        return Motion(x=motion.v, phi=turning(motion, state), v=f.inverse_mass[:, None] * wrench.F, L=tau)
+
+    def after(rate, share):
+        return jax.tree.map(lambda y, k: y + share * T[:, None] * k, start, rate)
+
+    start = Motion(x=f.x, phi=jnp.zeros_like(f.L), v=f.v, L=f.L)
+    tau = jnp.zeros_like(f.L) if f.tau is None else f.tau
+    first = Motion(x=f.v, phi=f.turn[:, 0], v=f.a, L=tau)
+    second = rates(after(first, 0.5))
+    third = rates(after(second, 0.5))
+    fourth = rates(after(third, 1.0))
+    mean = jax.tree.map(lambda a, b, c, d: (a + 2.0 * (b + c) + d) / 6.0, first, second, third, fourth)
+    end = after(mean, 1.0)
+    still = jnp.zeros_like
+    return end, Motion(x=end.v, phi=turning(end, placed(end)), v=still(end.v), L=still(end.L))
+
+
+def _through_end(f: Flight, end: tuple[Motion, Motion], T: Array) -> Flight:
+    """The flight with the curves that end at `end`; where T is 0 they are straight."""
+    (motion, rate), T = end, T[:, None]
+    jerk = safe_divide(6.0 * (motion.x - f.x - T * (f.v + 0.5 * T * f.a)), T**3)
+    jolt = safe_divide(2.0 * (motion.v - f.v - T * f.a), T**2)
+    first = f.turn[:, 0]
+    turn = jnp.stack(
+        [
+            first,
+            safe_divide(3.0 * motion.phi - T * (2.0 * first + rate.phi), T**2),
+            safe_divide(T * (first + rate.phi) - 2.0 * motion.phi, T**3),
+        ],
+        axis=1,
+    )
+    if f.tau is None:  # then L is kept, and the series is better
+        return replace(f, jerk=jerk, jolt=jolt)
+    twist = safe_divide(2.0 * (motion.L - f.L - T * f.tau), T**2)
+    return replace(f, jerk=jerk, jolt=jolt, twist=twist, turn=turn)
 
 
 def position(f: Flight, s: Array) -> Array:
     """Centre of mass of one body at time s, (D, *batch) [m]."""
     t = (s - f.t0)[None]
-    return f.x + t * (f.v + 0.5 * t * f.a)
+    rate = f.a if f.jerk is None else f.a + t * f.jerk / 3.0
+    return f.x + t * (f.v + 0.5 * t * rate)
 
 
 def orientation(f: Flight, s: Array) -> Array:

@@ -160,6 +160,38 @@ def normalise(a: Array, fallback: Array | None = None) -> Array:
     return jnp.where(nonzero[None], unit, jnp.zeros_like(a) if fallback is None else fallback)
 
 
+def solve_symmetric(matrix: Array, right: Array) -> Array:
+    """x of matrix x = right, for symmetric positive semidefinite matrices (R, R, *batch), (R, *batch) -> (R, *batch).
+
+    A direction in which the matrix is zero to rounding, as of a constraint that repeats others, is left out: x is
+    then one of many solutions, and finite. Gauss-Jordan without pivoting, one loop: the batch stays the last
+    axis, and the derivative is another solution.
+    """
+    count = matrix.shape[0]
+    tiny = 1e2 * jnp.finfo(matrix.dtype).eps * count
+
+    def solve(matvec, right):
+        del matvec
+        scale = lax.stop_gradient(jnp.abs(matrix).max((0, 1)))
+
+        def eliminate(k, system):
+            row = lax.dynamic_index_in_dim(system, k, 0, keepdims=False)
+            pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
+            inverse = jnp.where(pivot > tiny * scale, 1.0 / jnp.where(pivot > tiny * scale, pivot, 1.0), 0.0)
+            row = row * inverse[None]
+            column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
+            own = (jnp.arange(count) == k).astype(system.dtype).reshape(count, 1, *[1] * inverse.ndim)
+            return (1.0 - own) * (system - column[:, None] * row[None]) + own * row[None]
+
+        system = jnp.concatenate([lax.stop_gradient(matrix), right[:, None]], axis=1)
+        return lax.fori_loop(0, count, eliminate, system)[:, count]
+
+    def product(x):
+        return (matrix * x[None]).sum(1)
+
+    return lax.custom_linear_solve(product, right, solve, symmetric=True)
+
+
 def softplus(x: Array, width: Array) -> Array:
     """width * log(1 + exp(x / width)), and its limit max(x, 0) at width == 0 (which would be 0 / 0).
 

@@ -3,6 +3,7 @@
 restitution, friction, gravity           all bodies and statics; the gravity vector
 contact.width, contact.rest_speed        numbers of the contact model
 FORCE.field                              a force of the scene, by its name: "drag.linear"
+JOINT.field                              a joint of the scene, by its name: "revolute.anchor_a"
 BODY.mass | inertia | restitution | friction | shape.FIELD
 BODY.x | v | q | w | angle               initial state (angle: 2D)
 STATIC.x | q | angle | restitution | friction | shape.FIELD
@@ -93,6 +94,11 @@ def _catalogue(world: World) -> dict[str, list[Place]]:
                 out[f"{name}.{field}"] = [Place((0, "forces", index, field), None)]
         if isinstance(force, Gravity):
             out["gravity"] = [Place((0, "forces", index, "g"), None)]
+    for group, (names, joint) in enumerate(zip(world.joint_names, world.joints, strict=True)):
+        for row, name in enumerate(names):
+            for field in array_fields(joint):
+                if getattr(joint, field) is not None:
+                    out[f"{name}.{field}"] = [Place((0, "joints", group, field), row)]
     out |= {f"contact.{field}": [Place((0, "contact", field), None)] for field in array_fields(world.contact)}
     for row, name in enumerate(world.names):
         out |= {f"{name}.{f}": [Place((0, "bodies", f), row)] for f in ("mass", "inertia", "restitution", "friction")}

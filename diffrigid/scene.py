@@ -26,6 +26,7 @@ from diffrigid.convert import (
     stack,
 )
 from diffrigid.forces import Gravity
+from diffrigid.joint_checks import joints_of
 from diffrigid.overlap import overlapping, place
 from diffrigid.pytree import map_arrays
 from diffrigid.shape_checks import check_shape
@@ -84,6 +85,7 @@ def scene(
     friction: Any = 0.0,
     contact: Contact | None = None,
     forces: Sequence | Mapping = (),
+    joints: Sequence | Mapping = (),
     ignore: Sequence[tuple[str, str]] = (),
 ) -> tuple[World, State]:
     """World and initial state from named bodies.
@@ -95,7 +97,8 @@ def scene(
         contact: the contact model; default `Contact()`, exact impacts.
         forces: records from `diffrigid.forces`, in a sequence or by name; a name is what a path to it starts
             with, by default the class in lower case. They name bodies as `bodies` does.
-        ignore: pairs of names that pass through each other.
+        joints: records from `diffrigid.joints`, in a sequence or by name, as forces are.
+        ignore: pairs of names that pass through each other. The two bodies of a joint always do.
 
     Raises:
         ValueError: names the argument, what was expected, and the fix. Traced values are not checked.
@@ -106,7 +109,8 @@ def scene(
     moving, still = _sorted(bodies)
     everything: dict[str, Body | Static] = {**moving, **still}
     dim, n = _dimension(moving, gravity), len(moving)
-    passing = _passing(ignore, list(everything))
+    ends, joint_records = _joints(joints, moving, still, dim)
+    passing = _passing([*ignore, *ends], list(everything))
     shapes = {k: None if b.shape is None else shape_of(k, b.shape, dim) for k, b in everything.items()}
     solids = {name: solid_of(shapes[name], dim) for name in moving}
     records, offsets, owners = _stack_shapes(shapes, solids, dim)
@@ -121,6 +125,7 @@ def scene(
         statics=Statics(**_poses(still, dim), restitution=e[n:], friction=mu[n:]),
         shapes=records, offsets=offsets, owners=owners, pairs=pairs,
         forces=tuple(named_forces.values()), force_names=tuple(named_forces),
+        joints=joint_records[0], joint_names=joint_records[1],
         contact=_contact(Contact() if contact is None else contact),
         names=tuple(moving), static_names=tuple(still), own_restitution=own_e, own_friction=own_mu,
     )  # fmt: skip
@@ -257,6 +262,15 @@ def _forces(forces: Any, gravity: Any, moving: Mapping, still: Mapping, dim: int
             )
         named[name] = force_of(name, force, list(moving), dim)
     return named
+
+
+def _joints(joints: Any, moving: Mapping, still: Mapping, dim: int) -> tuple[list[tuple[str, str]], tuple]:
+    """Pairs of names of the colliders that are joined, and the joints of a world with their names."""
+    poses = _poses({**moving, **still}, dim)
+    records, names = joints_of(joints, list(moving), list(still), poses["x"], poses["q"], dim)
+    colliders = [*moving, *still, None]
+    joined = [(colliders[a], colliders[b]) for group in records for a, b in zip(group.a, group.b, strict=True)]
+    return [(a, b) for a, b in joined if a is not None and b is not None], (records, names)
 
 
 def _contact(contact: Any) -> Contact:

@@ -102,3 +102,30 @@ def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
     del q
     w = inverse[None] * L
     return jnp.stack([w, jnp.zeros_like(w) if tau is None else 0.5 * inverse[None] * tau])
+
+
+def turn_rate(phi: Array, w: Array) -> Array:
+    """Rate of the rotation vector phi since q0 where the body turns with w in its own axes, (1, *batch) [rad/s]."""
+    del phi
+    return w
+
+
+def rate(w: Array, q: Array) -> Array:
+    """dq/dt of a body that turns with w in world axes, (2, *batch) [1/s]."""
+    return w * perp(q)
+
+
+def difference(q: Array, p: Array) -> Array:
+    """p as seen from q: the rotation after which q brings to p."""
+    return unrotate(q, p)
+
+
+def sine(q: Array) -> Array:
+    """Sine of the angle of q, (1, *batch): the angle itself to first order."""
+    return q[1:]
+
+
+def gyroscopic(inertia: Array, q: Array, w: Array) -> Array:
+    """w x L, (1, *batch) [N m]: none in the plane."""
+    del inertia, q
+    return jnp.zeros_like(w)

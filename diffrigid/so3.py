@@ -147,3 +147,44 @@ def _convolve(a: list[Array], b: list[Array]) -> Array:
     """The highest coefficient of the cross product of two power series of equal length, sum_i a[i] x b[-1-i]."""
     first, second = jnp.stack(a, axis=1), jnp.stack(b[::-1], axis=1)
     return cross(first, second).sum(1)
+
+
+def turn_rate(phi: Array, w: Array) -> Array:
+    """Rate of the rotation vector phi since q0, q = q0 o exp(phi), where the body turns with w in its own axes.
+
+    (3, *batch) [rad/s], to fourth order in phi: the inverse right Jacobian, as in `turn_series`.
+    """
+    twist = cross(phi, w)
+    return w + 0.5 * twist + cross(phi, twist) / 12.0
+
+
+def rate(w: Array, q: Array) -> Array:
+    """dq/dt of a body that turns with w in world axes, (4, *batch) [1/s]."""
+    return 0.5 * jnp.concatenate([-dot(w, q[1:])[None], q[:1] * w + cross(w, q[1:])])
+
+
+def difference(q: Array, p: Array) -> Array:
+    """p as seen from q: the rotation after which q brings to p."""
+    return compose(jnp.concatenate([q[:1], -q[1:]]), p)
+
+
+def sine(q: Array) -> Array:
+    """Axis of q times the sine of its angle, (3, *batch): the rotation vector to first order."""
+    return 2.0 * q[:1] * q[1:]
+
+
+def gyroscopic(inertia: Array, q: Array, w: Array) -> Array:
+    """w x L, (3, *batch) [N m], world axes: the torque that a steady rotation would take."""
+    return cross(w, spin(inertia, q, w))
+
+
+def tangents(n: Array) -> list[Array]:
+    """Two unit vectors that with the unit vector n make a right-handed frame, (3, *batch) each.
+
+    Smooth except where n[2] changes its sign. Source: Duff et al., J. Computer Graphics Techniques 6 (2017) 1.
+    """
+    x, y, z = n
+    sign = jnp.where(z < 0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return [jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x]), jnp.stack([b, sign + y * y * a, -y])]

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.flight import Flight, launch
+from diffrigid.joints import onto_joints
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.state import State
 from diffrigid.world import World, check
@@ -115,9 +116,10 @@ def advance(world: World, state: State, dt: Array, controls: Any) -> State:
     """One step on arrays with aligned batch axes; dt (*batch)."""
 
     def launch_from(state: State, t0: Array) -> Flight:
-        return launch(world.forces, world.bodies, state, controls, t0, dt)
+        return launch(world, state, controls, t0, dt)
 
-    return world.contact(world, state, launch_from, dt)
+    end = world.contact(world, state, launch_from, dt)
+    return onto_joints(world.joints, world.statics, world.bodies, end) if world.joints else end
 
 
 def aligned(world: World, state: State) -> tuple[World, State]:

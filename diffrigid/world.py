@@ -35,10 +35,12 @@ class World:
     shapes: tuple = stacked("M")
     offsets: tuple  # of Offset or None, like shapes
     forces: tuple
+    joints: tuple = stacked("M")  # of one record for all joints of a kind
     contact: Contact
     names: tuple[str, ...] = static()  # of the moving bodies, in the order of State
     static_names: tuple[str, ...] = static()
     force_names: tuple[str, ...] = static()
+    joint_names: tuple[tuple[str, ...], ...] = static()  # of the rows of each record of `joints`
     owners: tuple[tuple[int, ...], ...] = static()
     pairs: tuple[PairGroup, ...] = static()
     own_restitution: tuple[bool, ...] = static()  # of each collider: given to it, not the scene's default

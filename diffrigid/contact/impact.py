@@ -71,7 +71,8 @@ def approach(a: Side, b: Side, t1: Array, width: Array | None, straight: bool):
 
     The speed is None where the time has no closed form.
     """
-    if not closed_form(a.shape, b.shape, straight):
+    varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
+    if varying or not closed_form(a.shape, b.shape, straight):
         return *_approach_search(a, b, t1, width), None
     return _approach_parabola(a, b, width) if isinstance(b.shape, HalfSpace) else _approach_straight(a, b, width)
 

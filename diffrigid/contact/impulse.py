@@ -22,6 +22,7 @@ from jax import Array
 
 from diffrigid.contact.sides import Placed
 from diffrigid.numerics import dot, safe_divide, safe_sqrt
+from diffrigid.so3 import tangents
 from diffrigid.state import rotations
 
 JAMMED = (
@@ -76,14 +77,10 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
 
 
 def _contact_frame(n: Array) -> list[list[Array]]:
-    """Components of n and of the unit tangents; in 3D after Duff et al., J. Computer Graphics Techniques 6 (2017) 1."""
+    """Components of n and of the unit tangents."""
     if n.shape[0] == 2:
         return [[n[0], n[1]], [-n[1], n[0]]]
-    x, y, z = n
-    sign = jnp.where(z < 0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return [[x, y, z], [1.0 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]]
+    return [list(n), *map(list, tangents(n))]
 
 
 def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array) -> list:

@@ -25,6 +25,7 @@ from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
 from diffrigid.contact.strikes import MATERIALS, Material, material, mixed, relative_path_is_straight, strikes_of
 from diffrigid.flight import Flight, orientation, position, velocity
+from diffrigid.forces import is_constant
 from diffrigid.numerics import apart, constant, dot, pack, safe_sqrt
 from diffrigid.pytree import replace
 from diffrigid.shapes import HalfSpace
@@ -62,7 +63,8 @@ def is_crowded(world: Any) -> bool:
         return closed_form(world.shapes[pairs.shape_a], world.shapes[pairs.shape_b], straight)
 
     one_disc_each = len({kind for kind, _ in bodies}) == 1 and sorted(o for _, o in bodies) == list(range(moving))
-    return count > CROWDED * moving and one_disc_each and all(map(solved, world.pairs))
+    quiet = is_constant(world.forces) and not world.joints
+    return count > CROWDED * moving and quiet and one_disc_each and all(map(solved, world.pairs))
 
 
 def tables_of(world: Any) -> tuple[Table, ...]:

@@ -69,7 +69,7 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
 
 def relative_path_is_straight(world: Any, both_move: bool) -> bool:
     """Whether a body's path is a straight line as seen from another: two fall alike, but not one and a static."""
-    return is_uniform(world.forces) if both_move else not world.forces
+    return is_uniform(world.forces) and not world.joints if both_move else not (world.forces or world.joints)
 
 
 def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
@@ -89,6 +89,9 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
         else:
             apart, closing = norm(x_a - x_b) - reach_of(a) - reach_of(b), norm(v_a - v_b)
         pull = sum(norm(side.flight.a) for side in (a, b) if side.flight is not None)
+        pull = pull + sum(
+            dt * norm(side.flight.jerk) for side in (a, b) if side.flight and side.flight.jerk is not None
+        )
         return jnp.any(apart <= dt * (closing + 0.5 * dt * pull) + margin)
 
     since = jnp.zeros_like(flight.t0)

@@ -1,0 +1,108 @@
+"""From joints as users write them to the records of a `World`: names, what is taken from the start, and mistakes."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid.convert import TYPED, known, nearest, numbers, stack
+from diffrigid.joints import JOINTS, Distance, Pose
+from diffrigid.pytree import array_fields, replace
+from diffrigid.shapes import traced
+from diffrigid.state import rotations
+
+
+def joints_of(joints: Any, moving: Sequence[str], still: Sequence[str], x: Any, q: Any, dim: int) -> tuple:
+    """Joints of one kind in one record each, and their names.
+
+    Args:
+        x, q: poses of all bodies, then all statics.
+
+    Raises:
+        ValueError: a joint between two statics, with unknown names, with an axis of no length, or with anchors
+            that do not meet at the start.
+    """
+    if not isinstance(joints, Mapping):
+        if isinstance(joints, str) or not isinstance(joints, Sequence):
+            raise ValueError(f"joints is {joints!r}: expected a sequence or a dict of joints; add brackets.")
+        kinds = [type(joint).__name__.lower() for joint in joints]
+        later = [kinds[:i].count(kind) for i, kind in enumerate(kinds)]
+        joints = {k + (str(i) if i else ""): j for k, i, j in zip(kinds, later, joints, strict=True)}
+    colliders = [*moving, *still]
+    groups: dict[Any, list[tuple[str, Any]]] = {}
+    for name, joint in joints.items():
+        if not isinstance(joint, JOINTS):
+            known_kinds = ", ".join(kind.__name__ for kind in JOINTS)
+            raise ValueError(f"joints: {name!r} is {joint!r}: expected one of {known_kinds}.")
+        for side in ("a", "b"):
+            body = getattr(joint, side)
+            if body not in colliders and (side == "a" or body is not None):
+                raise ValueError(f"{name}.{side} is {body!r}, which is not a body: {nearest(body, colliders)}")
+        if joint.a not in moving and joint.b not in moving:
+            raise ValueError(f"{name} joins {joint.a!r} to {joint.b!r}: expected one that moves; name a Body.")
+        if joint.a == joint.b:
+            raise ValueError(f"{name} joins {joint.a!r} to itself: expected two bodies.")
+        groups.setdefault(type(joint), []).append((name, _filled(name, joint, colliders, x, q, dim)))
+    records, names = [], []
+    for members in groups.values():
+        names.append(tuple(name for name, _ in members))
+        same = [joint for _, joint in members]
+        ends = {side: tuple(getattr(joint, side) for joint in same) for side in ("a", "b")}
+        bare = [replace(joint, a=None, b=None) for joint in same]
+        records.append(replace(jax.tree.map(lambda *leaves: stack(leaves), *bare), **ends))
+    return tuple(records), tuple(names)
+
+
+def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: int) -> Any:
+    """The joint with colliders for names, the world being the last, and arrays in all its fields."""
+    so = rotations(dim)
+    ends = {"a": colliders.index(joint.a), "b": len(colliders) if joint.b is None else colliders.index(joint.b)}
+    world: Any = Pose(np.zeros(dim, jnp.result_type(float)), np.eye(so.Q, dtype=jnp.result_type(float))[0])  # type: ignore[arg-type]
+    a, b = (Pose(x[k], q[k]) if k < len(colliders) else world for k in ends.values())
+    fields = array_fields(joint)
+    if dim == 2:
+        fields = [field for field in fields if field != "axis_a" and not (field == "axis_b" and "axis_a" in fields)]
+    elif "axis_a" in fields and joint.axis_a is None:
+        raise ValueError(f"{name}.axis_a is missing: expected the axis of the hinge in the axes of {joint.a!r}, (3,).")
+    given: dict[str, Any] = {}
+    for field in fields:
+        value = getattr(joint, field)
+        if value is not None:
+            shape = () if field == "length" else (so.Q,) if field == "q" else (dim,)
+            array = numbers(f"{name}.{field}", value, None)
+            array = numbers(f"{name}.{field}", np.broadcast_to(array, shape) if array.ndim == 0 else array, shape)
+            given[field] = _unit(f"{name}.{field}", array) if field.startswith("axis") else array
+    start = {
+        "anchor_b": lambda: so.unrotate(b.q, a.x + so.rotate(a.q, given["anchor_a"]) - b.x),
+        "axis_b": lambda: so.unrotate(b.q, so.rotate(a.q, given["axis_a"])),
+        "q": lambda: so.difference(b.q, a.q),
+    }
+    length = given.pop("length", None)
+    made = {field: known(start[field]) for field in fields if field in start and field not in given}
+    if isinstance(joint, Distance):
+        gap = known(lambda: _length(so, a, b, given["anchor_a"], given["anchor_b"]))
+        made["length"] = gap if length is None else length
+    filled = replace(joint, **given, **made, **ends)
+    error = known(lambda: filled(so, a, b))
+    if not traced(error) and np.abs(error).max() > TYPED:
+        raise ValueError(
+            f"{name} does not hold at the start: it is off by {np.linalg.norm(error):.3g} (m, rad); move a body, or "
+            "leave out what belongs to b, which is then taken from the start."
+        )
+    return filled
+
+
+def _length(so: Any, a: Pose, b: Pose, anchor_a: Any, anchor_b: Any) -> Any:
+    apart = a.x + so.rotate(a.q, anchor_a) - b.x - so.rotate(b.q, anchor_b)
+    return jnp.sqrt((apart**2).sum())
+
+
+def _unit(where: str, axis: Any) -> Any:
+    if traced(axis):
+        return axis
+    size = np.linalg.norm(axis)
+    if size == 0:
+        raise ValueError(f"{where} has no length: expected a direction.")
+    return axis / size
