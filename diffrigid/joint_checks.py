@@ -1,5 +1,6 @@
 """From joints as users write them to the records of a `World`: names, what is taken from the start, and mistakes."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.convert import TYPED, known, nearest, numbers, stack
-from diffrigid.joints import JOINTS, Distance, Pose
+from diffrigid.joints import JOINTS, Distance, Pose, jacobian, separation
+from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, replace
 from diffrigid.shapes import traced
 from diffrigid.state import rotations
@@ -70,22 +72,19 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
     for field in fields:
         value = getattr(joint, field)
         if value is not None:
-            shape = () if field == "length" else (so.Q,) if field == "q" else (dim,)
+            shape = {"length": (), "q": (so.Q,)}.get(field, (dim,))
             array = numbers(f"{name}.{field}", value, None)
             array = numbers(f"{name}.{field}", np.broadcast_to(array, shape) if array.ndim == 0 else array, shape)
             given[field] = _unit(f"{name}.{field}", array) if field.startswith("axis") else array
-    start = {
-        "anchor_b": lambda: so.unrotate(b.q, a.x + so.rotate(a.q, given["anchor_a"]) - b.x),
-        "axis_b": lambda: so.unrotate(b.q, so.rotate(a.q, given["axis_a"])),
-        "q": lambda: so.difference(b.q, a.q),
+    at_start = {
+        "anchor_b": lambda a, b, given: so.unrotate(b.q, a.x + so.rotate(a.q, given["anchor_a"]) - b.x),
+        "axis_b": lambda a, b, given: so.unrotate(b.q, so.rotate(a.q, given["axis_a"])),
+        "q": lambda a, b, given: so.difference(b.q, a.q),
+        "length": lambda a, b, given: norm(separation(Distance(a=None, **given), so, a, b)),
     }
-    length = given.pop("length", None)
-    made = {field: known(start[field]) for field in fields if field in start and field not in given}
-    if isinstance(joint, Distance):
-        gap = known(lambda: _length(so, a, b, given["anchor_a"], given["anchor_b"]))
-        made["length"] = gap if length is None else length
+    made = {field: known(at_start[field], a, b, given) for field in fields if field in at_start and field not in given}
     filled = replace(joint, **given, **made, **ends)
-    error = known(lambda: filled(so, a, b))
+    error = known(lambda joint, a, b: joint(so, a, b), filled, a, b)
     if not traced(error) and np.abs(error).max() > TYPED:
         raise ValueError(
             f"{name} does not hold at the start: it is off by {np.linalg.norm(error):.3g} (m, rad); move a body, or "
@@ -94,9 +93,27 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
     return filled
 
 
-def _length(so: Any, a: Pose, b: Pose, anchor_a: Any, anchor_b: Any) -> Any:
-    apart = a.x + so.rotate(a.q, anchor_a) - b.x - so.rotate(b.q, anchor_b)
-    return jnp.sqrt((apart**2).sum())
+def warn_of_torn_joints(world: Any, state: Any) -> None:
+    """Warn of joints whose bodies move apart at the start."""
+    if not world.joints:
+        return
+
+    def speeds(world: Any, state: Any) -> Any:
+        parts = []
+        for group in world.joints:
+            jac = jacobian((group,), world.statics, world.bodies, state)
+            rates = (jac.rows * jnp.concatenate([state.v, state.w], axis=1).reshape(1, -1)).sum(1)
+            parts.append(jnp.sqrt((rates.reshape(len(group.a), -1) ** 2).sum(1)))
+        return jnp.concatenate(parts)
+
+    rates = known(speeds, jax.tree.map(jnp.asarray, world), jax.tree.map(jnp.asarray, state))
+    for name, speed in zip([name for group in world.joint_names for name in group], rates, strict=True):
+        if speed > TYPED:
+            warnings.warn(
+                f"{name}: velocities at the start do not fit, the joint comes apart at {speed:.3g} m/s or rad/s; the "
+                "first step begins with the impulse that mends it. Give the bodies v and w that fit.",
+                stacklevel=3,
+            )
 
 
 def _unit(where: str, axis: Any) -> Any:

@@ -56,7 +56,7 @@ class Revolute:
     axis_b: Leaf = array("D", default=None)  # (3, *batch) [-] 3D
 
     def __call__(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        apart = _separation(self, so, a, b)
+        apart = separation(self, so, a, b)
         if so.D == 2:
             return apart
         along = so.rotate(a.q, self.axis_a)
@@ -73,7 +73,7 @@ class Ball:
     anchor_b: Leaf = array("D", default=None)  # (D, *batch) [m]
 
     def __call__(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        return _separation(self, so, a, b)
+        return separation(self, so, a, b)
 
 
 @pytree
@@ -87,7 +87,7 @@ class Weld:
     q: Leaf = array("Q", default=None)  # (Q, *batch) orientation of a in the axes of b
 
     def __call__(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        return jnp.concatenate([_separation(self, so, a, b), _turn(self, so, a, b)])
+        return jnp.concatenate([separation(self, so, a, b), _turn(self, so, a, b)])
 
 
 @pytree
@@ -102,7 +102,7 @@ class Prismatic:
     q: Leaf = array("Q", default=None)  # (Q, *batch) orientation of a in the axes of b
 
     def __call__(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        apart = _separation(self, so, a, b)
+        apart = separation(self, so, a, b)
         across = [perp(self.axis_b)] if so.D == 2 else tangents(self.axis_b)
         off_line = jnp.stack([dot(so.rotate(b.q, t), apart) for t in across])
         return jnp.concatenate([off_line, _turn(self, so, a, b)])
@@ -119,13 +119,13 @@ class Distance:
     length: Leaf = array(default=None)  # (*batch) [m]; None: as at the start
 
     def __call__(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        return (norm(_separation(self, so, a, b)) - self.length)[None]
+        return (norm(separation(self, so, a, b)) - self.length)[None]
 
 
 JOINTS = (Revolute, Ball, Weld, Prismatic, Distance)
 
 
-def _separation(joint: Any, so: ModuleType, a: Pose, b: Pose) -> Array:
+def separation(joint: Any, so: ModuleType, a: Pose, b: Pose) -> Array:
     """From anchor b to anchor a, (D, *batch) [m]."""
     return a.x + so.rotate(a.q, joint.anchor_a) - b.x - so.rotate(b.q, joint.anchor_b)
 
@@ -200,6 +200,48 @@ def _poses(statics: Any, state: State, ends: tuple[int, ...]) -> Pose:
     world = jnp.zeros_like(state.x[:1]), jnp.zeros_like(state.q[:1]).at[:, 0].set(1.0)
     x, q = (jnp.concatenate(parts) for parts in zip((state.x, state.q), still, world, strict=True))
     return Pose(rows(x, ends), rows(q, ends))
+
+
+def islands(joints: tuple, moving: int) -> tuple[tuple[int, ...], ...]:
+    """The bodies that hang together with each body by joints, itself included; moving bodies only."""
+    together = [{body} for body in range(moving)]
+    for group in joints:
+        for a, b in zip(group.a, group.b, strict=True):
+            if a < moving and b < moving and together[a] is not together[b]:
+                together[a] |= together[b]
+                for body in together[b]:
+                    together[body] = together[a]
+    return tuple(tuple(sorted(bodies)) for bodies in together)
+
+
+@pytree
+class Linkage:
+    """How joints spread impulses: lam = -inverse (J twist) for a change of the twists of free bodies."""
+
+    rows: Array = array("R", "C")  # (R, C, *batch) J
+    mobile: Array = array("R", "C")  # (R, C, *batch) J M^-1
+    inverse: Array = array("R", "R")  # (R, R, *batch) of J M^-1 J^T
+
+
+def linkage(joints: tuple, statics: Any, bodies: Bodies, state: State) -> Linkage:
+    """Of the joints of a world at these poses."""
+    jac = jacobian(joints, statics, bodies, state)
+    matrix = (jac.rows[:, None] * jac.mobile[None]).sum(2)
+    count = matrix.shape[0]
+    units = jnp.eye(count, dtype=matrix.dtype).reshape(count, count, *[1] * (matrix.ndim - 2)) + jnp.zeros_like(matrix)
+    inverse = jax.vmap(lambda unit: solve_symmetric(matrix, unit))(units)
+    return Linkage(rows=jac.rows, mobile=jac.mobile, inverse=inverse)
+
+
+def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
+    """Changes of v, w and L that the joints add to changes dv (N, D, *batch), dw (N, A, *batch) of free bodies."""
+    (moving, D), A = dv.shape[:2], dw.shape[1]
+    twist = jnp.concatenate([dv, dw], axis=1).reshape(moving * (D + A), *dv.shape[2:])
+    lam = -(link.inverse * (link.rows * twist[None]).sum(1)[None]).sum(1)
+    moved, forced = (
+        (side * lam[:, None]).sum(0).reshape(moving, D + A, *lam.shape[1:]) for side in (link.mobile, link.rows)
+    )
+    return moved[:, :D], moved[:, D:], forced[:, D:]
 
 
 def _multipliers(jac: Jacobian, target: Array) -> Array:

@@ -26,7 +26,7 @@ from diffrigid.convert import (
     stack,
 )
 from diffrigid.forces import Gravity
-from diffrigid.joint_checks import joints_of
+from diffrigid.joint_checks import joints_of, warn_of_torn_joints
 from diffrigid.overlap import overlapping, place
 from diffrigid.pytree import map_arrays
 from diffrigid.shape_checks import check_shape
@@ -104,7 +104,8 @@ def scene(
         ValueError: names the argument, what was expected, and the fix. Traced values are not checked.
 
     Warns:
-        UserWarning: bodies that overlap at the start.
+        UserWarning: bodies that overlap at the start, and velocities that do not fit the joints: the first step
+            then begins with the impulse that makes them fit.
     """
     moving, still = _sorted(bodies)
     everything: dict[str, Body | Static] = {**moving, **still}
@@ -131,6 +132,8 @@ def scene(
     )  # fmt: skip
     start = _state(moving, dim)
     _warn_of_overlap(made, start, shapes, solids)
+    if not traced((made, start)):
+        warn_of_torn_joints(made, start)
     return jax.tree.map(jnp.asarray, (made, start))
 
 

@@ -1,10 +1,10 @@
-"""jit, vmap, batches, types, times and controls change no numbers; forces that vary are second order."""
+"""jit, vmap, batches, types, times and controls change no numbers; forces that vary are fourth order."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_form import BALL, CASES, bouncing, disc_and_plane, made, vector
+from closed_form import BALL, CASES, bouncing, disc_and_plane, made, numpy_motion, vector
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -155,9 +155,9 @@ def order(error_at, steps):
     return np.log2(coarse / fine), fine
 
 
-def assert_second_order(error_at, steps, finest):
+def assert_fourth_order(error_at, steps, finest):
     observed, fine = order(error_at, steps)
-    assert 1.85 < observed < 2.15, f"order {observed:.2f}, error {fine:.1e}"
+    assert 3.85 < observed < 4.15, f"order {observed:.2f}, error {fine:.1e}"
     assert fine < finest
 
 
@@ -181,8 +181,8 @@ def test_drag_is_exponential_decay():
         return np.abs(errors)
 
     coarse, fine = error(30), error(60)
-    assert (np.abs(np.log2(coarse / fine) - 2.0) < 0.15).all()  # every component
-    assert fine.max() < 1e-3
+    assert (np.abs(np.log2(coarse / fine) - 4.0) < 0.15).all()  # every component
+    assert fine.max() < 1e-8
 
 
 def test_spring_and_damper_oscillate():
@@ -200,7 +200,7 @@ def test_spring_and_damper_oscillate():
         assert_allclose(s.x[0, 1], 0.5, atol=ROUNDING)
         return abs(float(s.x[0, 0]) - x)
 
-    assert_second_order(error, 60, 3e-3)
+    assert_fourth_order(error, 60, 1e-6)
 
 
 def test_spring_between_bodies_keeps_momentum():
@@ -228,7 +228,7 @@ def test_spring_between_bodies_keeps_momentum():
     (p, L, pulled), (_, L_fine, _) = drift(0.01), drift(0.005)
     assert pulled > 0.5
     assert p < ROUNDING
-    assert L < 1e-3 and L_fine < 0.3 * L  # second order or better over the same number of steps, half the time
+    assert L < 1e-6 and L_fine < 0.05 * L  # fifth order over the same number of steps, half the time
 
 
 def test_force_at_a_point_pushes_and_turns():
@@ -236,23 +236,14 @@ def test_force_at_a_point_pushes_and_turns():
     m, I, F, l, angle, t = 2.0, 0.3, 1.5, 0.4, 1.0, 1.5
     body = dr.Body(None, mass=m, inertia=I, x=(0.2, 0.1), v=(0.0, 0.3), angle=angle)
     scene = dr.scene({"body": body}, forces=[dr.Force(body="body", F=(F, 0.0), point=(l, 0.0))])
-    y, h = np.array([angle, 0.0]), t / 1000
-
-    def rate(y):
-        return np.array([y[1], -l * F / I * np.sin(y[0])])
-
-    for _ in range(1000):  # Runge-Kutta, error about 1e-11
-        k1 = rate(y)
-        k2 = rate(y + h / 2 * k1)
-        k3 = rate(y + h / 2 * k2)
-        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(y + h * k3))
+    y = numpy_motion(lambda y: np.array([y[1], -l * F / I * np.sin(y[0])]), (angle, 0.0), t)
 
     def error(steps):
         s = last(scene, t, steps)
         assert_allclose(s.x[0], [0.2 + F / m * t * t / 2, 0.1 + 0.3 * t], atol=ROUNDING)  # the force does not turn
         return abs(float(jnp.arctan2(s.q[0, 1], s.q[0, 0])) - y[0])
 
-    assert_second_order(error, 60, 1e-3)
+    assert_fourth_order(error, 60, 1e-8)
 
 
 def test_torque_in_space_turns_about_its_axis():

@@ -27,7 +27,8 @@ from diffrigid.contact.isolated import is_crowded, meet, next_impacts, tables_of
 from diffrigid.contact.resting import Mobility, Strikes, momentum_changes, solve_impulses, velocities
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
 from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
-from diffrigid.flight import Flight, orientation, state_at
+from diffrigid.flight import Flight, orientation, position, state_at
+from diffrigid.joints import islands, linkage
 from diffrigid.numerics import dot, rows
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
@@ -118,7 +119,8 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     restitution, friction = (mixed(*(material(world, name, index[side]) for side in "ab")) for name in MATERIALS)
     u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
     slow = u <= world.contact.rest_speed[None]
-    now = strikes.active & _is_next(strikes, strikes.active & ~slow, len(world.names), dt)
+    hang_together = islands(world.joints, len(world.names))
+    now = strikes.active & _is_next(strikes, strikes.active & ~slow, hang_together, dt)
     rests = slow | (2.0 * restitution * u <= strikes.push * (dt[None] - strikes.s))
     found = resting | (strikes.active & (slow | (now & rests)))
     held = jnp.where(push, resting, strikes.active & (resting | _falls_along(flight, world, u, dt)))
@@ -131,7 +133,7 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         evenly = 0.5 * (dt[None] - anchors.t0)
         lever = jnp.where(impact, 0.0, jnp.where(push, 1.0, evenly))
-        return _apply(anchors, flight, strikes, target, jnp.where(push, 0.0, friction), kick, lever)
+        return _apply(world, anchors, flight, strikes, target, jnp.where(push, 0.0, friction), kick, lever)
 
     any_now = jnp.any(now)
     return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, jnp.any(resting)
@@ -143,18 +145,34 @@ def _falls_along(flight: Flight, world: Any, u: Array, dt: Array) -> Array:
     return u <= (world.contact.rest_speed + 2.0 * fall)[None]
 
 
-def _is_next(strikes: Strikes, fast: Array, moving: int, dt: Array) -> Array:
-    """Contacts at the time of the first fast impact of both their bodies; ties within rounding act together."""
+def _is_next(strikes: Strikes, fast: Array, islands: tuple[tuple[int, ...], ...], dt: Array) -> Array:
+    """Contacts at the time of the first fast impact of both their bodies; ties within rounding act together.
+
+    An impact reaches all bodies that hang together by joints.
+    """
     s = lax.stop_gradient(strikes.s)
     tie = jnp.sqrt(jnp.finfo(s.dtype).eps) * dt[None]
     times = jnp.where(fast, s, jnp.inf)
     padded = jnp.concatenate([times, times, jnp.full_like(times[:1], jnp.inf)])
-    first = rows(padded, body_sides(strikes.a, strikes.b, moving)).min(1)
+    first = _over_islands(
+        jnp.min, rows(padded, body_sides(strikes.a, strikes.b, len(islands))).min(1), islands, jnp.inf
+    )
     earliest = jnp.minimum(at_colliders(first, strikes.a, jnp.inf), at_colliders(first, strikes.b, jnp.inf))
     return jnp.abs(s - earliest) <= tie
 
 
-def _apply(anchors: Anchors, flight: Flight, strikes: Strikes, target, mu, kick: Array, lever: Array) -> Anchors:
+def _over_islands(reduce: Callable, values: Array, islands: tuple[tuple[int, ...], ...], none: float) -> Array:
+    """Values of the bodies (N, ...) reduced over those that hang together with each, (N, ...)."""
+    most = max(map(len, islands))
+    if most == 1:
+        return values
+    padded = jnp.concatenate([values, jnp.full_like(values[:1], none)])
+    return reduce(rows(padded, tuple(i + (len(islands),) * (most - len(i)) for i in islands)), axis=1)
+
+
+def _apply(
+    world: Any, anchors: Anchors, flight: Flight, strikes: Strikes, target, mu, kick: Array, lever: Array
+) -> Anchors:
     """Solve for the impulses and anchor every struck body anew at the time of its impact.
 
     Anchoring is the lever x += (h - s) P / m and, for turns, the composition of those before and after s.
@@ -165,23 +183,27 @@ def _apply(anchors: Anchors, flight: Flight, strikes: Strikes, target, mu, kick:
     """
     moving, active = flight.t0.shape[0], strikes.active.astype(kick.dtype)
     both = jnp.stack([active, active * strikes.s], axis=1)
-    count, total = jnp.moveaxis(side_sum(both, both, strikes.a, strikes.b, moving), 1, 0)
+    own = side_sum(both, both, strikes.a, strikes.b, moving)
+    count, total = jnp.moveaxis(_over_islands(jnp.sum, own, islands(world.joints, moving), 0.0), 1, 0)
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
-    q, mobility = _posed(flight, t)
-    P = solve_impulses(strikes, target, mu, mobility, count)
-    dp, dL = momentum_changes(strikes, P, moving)
-    dv, dw = velocities(mobility, dp, dL)
+    q, mobility = _posed(world, flight, t)
+    P = solve_impulses(strikes, target, mu, mobility, own[:, 0])
+    dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     moved = lever[:, None] * dv, lever[:, None] * dw
     # A displacement P / m moves the angular momentum about the origin by P x v: both bodies give back half of it.
     _, kept = momentum_changes(replace(strikes, arm_a=strikes.drift, arm_b=-strikes.drift), P, moving)
     return _anchored(anchors, flight, t, q, count > 0, (kick * dv, kick * dL + (1.0 - kick) * kept), moved)
 
 
-def _posed(flight: Flight, t: Array) -> tuple[Array, Mobility]:
+def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility]:
     """Orientations of all bodies, each at its own time t (N, *batch), and their mobility there."""
-    q = jax.vmap(orientation)(flight, t)
-    inverse = jax.vmap(rotations(flight.dim).world_inverse)(flight.inverse_inertia, q)
-    return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse)
+    q, so = jax.vmap(orientation)(flight, t), rotations(flight.dim)
+    inverse, link = jax.vmap(so.world_inverse)(flight.inverse_inertia, q), None
+    if world.joints:
+        still = jnp.zeros_like(flight.v)
+        state = State(x=jax.vmap(position)(flight, t), q=q, v=still, w=jnp.zeros_like(flight.L))
+        link = linkage(world.joints, world.statics, world.bodies, state)
+    return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse, link=link)
 
 
 def _anchored(anchors: Anchors, flight: Flight, t, q, hit, kicked, moved) -> Anchors:

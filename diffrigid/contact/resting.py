@@ -8,6 +8,7 @@ from jax import Array, lax
 
 from diffrigid.contact.impulse import impulses, times
 from diffrigid.contact.sides import at_colliders, side_sum
+from diffrigid.joints import Linkage, spread
 from diffrigid.numerics import safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import rotations
@@ -49,6 +50,7 @@ class Mobility:
 
     inverse_mass: Array = array("N")  # [1/kg]
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
+    link: Linkage | None = None  # of the joints between them
 
 
 def momentum_changes(arms: Strikes | Arms, P: Array, moving: int) -> tuple[Array, Array]:
@@ -60,10 +62,14 @@ def momentum_changes(arms: Strikes | Arms, P: Array, moving: int) -> tuple[Array
     return total[:, : so.D], total[:, so.D :]
 
 
-def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array]:
-    """Changes of v [m/s] and w [rad/s] that go with those of m v and L."""
+def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, Array]:
+    """Changes of v [m/s], w [rad/s] and L by impulses dp and dL on the bodies, and by what the joints make of them."""
     apply = rotations(dp.shape[1]).apply
-    return mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL)
+    dv, dw = mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL)
+    if mobility.link is None:
+        return dv, dw, dL
+    more = spread(mobility.link, dv, dw)
+    return dv + more[0], dw + more[1], dL + more[2]
 
 
 def relative_changes(arms: Strikes | Arms, dv: Array, dw: Array) -> Array:
@@ -100,7 +106,8 @@ def solve_impulses(strikes: Strikes, target: Array, mu: Array, mobility: Mobilit
     unit = jnp.eye(strikes.K.shape[1], dtype=size.dtype).reshape(1, *strikes.K.shape[1:3], *[1] * (size.ndim - 1))
     K = jnp.where((split > 1)[:, None, None], (split * size)[:, None, None] * unit, strikes.K)
     law = Law(K=K, normal=strikes.normal, target=target, mu=mu, on=one)
-    return _fixed_point(jnp.any((split > 1) & strikes.active), law, strikes.v_rel, arms, mobility)
+    together = strikes.active & ((split > 1) | (mobility.link is not None))
+    return _fixed_point(jnp.any(together), law, strikes.v_rel, arms, mobility)
 
 
 @pytree
@@ -121,7 +128,8 @@ def _apply_law(law: Law, v: Array) -> Array:
 def _others(law: Law, P: Array, arms: Arms, mobility: Mobility) -> Array:
     """Change of the relative velocity at every contact by the impulses at all others, (C, D, *batch) [m/s]."""
     changes = momentum_changes(arms, P, mobility.inverse_mass.shape[0])
-    return relative_changes(arms, *velocities(mobility, *changes)) - jax.vmap(times)(law.K, P)
+    dv, dw, _ = velocities(mobility, *changes)
+    return relative_changes(arms, dv, dw) - jax.vmap(times)(law.K, P)
 
 
 @jax.custom_jvp

@@ -88,10 +88,9 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
             apart, closing = dot(n, x_a - x_b) - b.shape.offset - reach_of(a), jnp.abs(dot(n, v_a - v_b))
         else:
             apart, closing = norm(x_a - x_b) - reach_of(a) - reach_of(b), norm(v_a - v_b)
-        pull = sum(norm(side.flight.a) for side in (a, b) if side.flight is not None)
-        pull = pull + sum(
-            dt * norm(side.flight.jerk) for side in (a, b) if side.flight and side.flight.jerk is not None
-        )
+        pull = jnp.zeros_like(dt)
+        for f in (side.flight for side in (a, b) if side.flight is not None):
+            pull = pull + norm(f.a) + (0.0 if f.jerk is None else dt * norm(f.jerk))
         return jnp.any(apart <= dt * (closing + 0.5 * dt * pull) + margin)
 
     since = jnp.zeros_like(flight.t0)
