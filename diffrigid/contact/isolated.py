@@ -256,7 +256,7 @@ def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, 
     def blow(unpack_b: Callable, columns_a: list, columns_b: list, there: Array) -> Blow:
         (a, own), (b, others) = unpack(columns_a), unpack_b(columns_b)
         strike = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, b)
-        strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, push=None, drift=None))
+        strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, pull=None, drift=None))
         return Blow(_sum(there) * strike.active.astype(dt.dtype), strike, *map(mixed, own, others))
 
     def impulse(blows: list[Blow]) -> tuple:

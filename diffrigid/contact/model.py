@@ -25,11 +25,11 @@ from jax import Array, lax
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.isolated import is_crowded, meet, next_impacts, tables_of
 from diffrigid.contact.resting import Mobility, Strikes, momentum_changes, solve_impulses, velocities
-from diffrigid.contact.sides import at_colliders, body_sides, side_sum
+from diffrigid.contact.sides import at_colliders, body_sides, same_bodies, side_sum
 from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
 from diffrigid.flight import Flight, orientation, position, state_at
 from diffrigid.joints import islands, linkage
-from diffrigid.numerics import dot, rows
+from diffrigid.numerics import dot, norm, rows, safe_divide
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
@@ -121,7 +121,8 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     slow = u <= world.contact.rest_speed[None]
     hang_together = islands(world.joints, len(world.names))
     now = strikes.active & _is_next(strikes, strikes.active & ~slow, hang_together, dt)
-    rests = slow | (2.0 * restitution * u <= strikes.push * (dt[None] - strikes.s))
+    closing = -jax.vmap(dot)(strikes.normal, strikes.pull)
+    rests = slow | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
     found = resting | (strikes.active & (slow | (now & rests)))
     held = jnp.where(push, resting, strikes.active & (resting | _falls_along(flight, world, u, dt)))
     now, resting = jnp.where(impact, now, held), jnp.where(impact, found, held)
@@ -133,7 +134,9 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         evenly = 0.5 * (dt[None] - anchors.t0)
         lever = jnp.where(impact, 0.0, jnp.where(push, 1.0, evenly))
-        return _apply(world, anchors, flight, strikes, target, jnp.where(push, 0.0, friction), kick, lever)
+        began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
+        held_for = jnp.where(impact | push, 0.0, dt[None] - began)
+        return _apply(world, anchors, flight, strikes, target, jnp.where(push, 0.0, friction), kick, lever, held_for)
 
     any_now = jnp.any(now)
     return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, jnp.any(resting)
@@ -171,7 +174,15 @@ def _over_islands(reduce: Callable, values: Array, islands: tuple[tuple[int, ...
 
 
 def _apply(
-    world: Any, anchors: Anchors, flight: Flight, strikes: Strikes, target, mu, kick: Array, lever: Array
+    world: Any,
+    anchors: Anchors,
+    flight: Flight,
+    strikes: Strikes,
+    target,
+    mu,
+    kick: Array,
+    lever: Array,
+    held_for: Array,
 ) -> Anchors:
     """Solve for the impulses and anchor every struck body anew at the time of its impact.
 
@@ -180,6 +191,7 @@ def _apply(
     Args:
         kick: 1, or 0 for a displacement that leaves velocities as they are.
         lever: (N, *batch) [s] displacement per change of velocity.
+        held_for: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
     """
     moving, active = flight.t0.shape[0], strikes.active.astype(kick.dtype)
     both = jnp.stack([active, active * strikes.s], axis=1)
@@ -189,10 +201,37 @@ def _apply(
     q, mobility = _posed(world, flight, t)
     P = solve_impulses(strikes, target, mu, mobility, own[:, 0])
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    moved = lever[:, None] * dv, lever[:, None] * dw
+    early = velocities(mobility, *momentum_changes(strikes, _stopping_early(strikes, P, mu, held_for), moving))
+    moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
     # A displacement P / m moves the angular momentum about the origin by P x v: both bodies give back half of it.
     _, kept = momentum_changes(replace(strikes, arm_a=strikes.drift, arm_b=-strikes.drift), P, moving)
     return _anchored(anchors, flight, t, q, count > 0, (kick * dv, kick * dL + (1.0 - kick) * kept), moved)
+
+
+def _stopping_early(strikes: Strikes, P: Array, mu: Array, T: Array) -> Array:
+    """What the impulses P, taken as even over T, move too little where the slip stops before: (C, D, *batch) [N s^2].
+
+    Friction first stops the slip with all of its bound, then holds against the pull, evenly. Stopping takes the
+    part of P that goes with the slip at the beginning, with its centroid at half the time tau until the stop instead
+    of T / 2: so it moves the contact by a further (T - tau) / 2. Exact for one direction of slip under a constant pull.
+    """
+    n, together = strikes.normal, same_bodies(strikes.a, strikes.b)
+
+    def in_all(values: Array) -> Array:  # over the contacts of the same two bodies, which slip as one
+        return rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), together).sum(1)
+
+    def across(r: Array) -> Array:
+        return r - jax.vmap(dot)(n, r)[:, None] * n
+
+    at_end, friction = across(strikes.v_rel), across(P)
+    slip = at_end - T[:, None] * across(strikes.pull)
+    speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
+    along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
+    size, bound = jax.vmap(norm)(in_all(friction)), in_all(mu * jax.vmap(dot)(n, P))
+    share = safe_divide(speed * size, at_end_speed * bound + size * (speed - along))  # tau / T
+    stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0)
+    lost = 0.5 * T * (1.0 - jnp.clip(share, 0.0, 1.0)) * safe_divide(own, at_end_speed)
+    return jnp.where(stops[:, None], -lost[:, None] * slip, 0.0)
 
 
 def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility]:

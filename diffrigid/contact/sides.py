@@ -152,6 +152,16 @@ def body_sides(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> tuple[tup
     return tuple(tuple(rows + [2 * len(a)] * (most - len(rows))) for rows in sides)
 
 
+@functools.cache
+def same_bodies(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+    """For each of C contacts, those between the same two colliders, itself included, padded by C; (C, most)."""
+    members: dict[tuple[int, int], list[int]] = {}
+    for contact, pair in enumerate(zip(a, b, strict=True)):
+        members.setdefault(pair, []).append(contact)
+    most = max(map(len, members.values()))
+    return tuple(tuple(m + [len(a)] * (most - len(m))) for m in (members[pair] for pair in zip(a, b, strict=True)))
+
+
 def at_colliders(values: Array, colliders: tuple[int, ...], fill: float) -> Array:
     """Values of the moving bodies (N, ...) at each contact's collider, (C, ...); `fill` for statics."""
     still = max(colliders) + 1 - values.shape[0]

@@ -41,6 +41,7 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
 
     A resting force acts evenly over the time since the last impact, so its impulse at the middle of that. There
     the bodies were elsewhere: the arms are those to one point that both had then, which keeps angular momentum.
+    On a static the body did not fall through the surface: its arm is to its own surface, not to the middle of a gap.
     """
     both_move = a.flight is not None and b.flight is not None
     straight, rest_speed = relative_path_is_straight(world, both_move), world.contact.rest_speed
@@ -48,20 +49,19 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
     at_a, at_b = place(a, s), place(b, s)
     contacts = contacts_of(a, at_a, b, at_b)
     active = (contacts.gap <= (level + slack)[None]) & hit[None]
-    pulled, drift = -_acceleration(at_a, at_b), jnp.zeros_like(at_a.x)
+    pull, drift = _acceleration(at_a, at_b), jnp.zeros_like(at_a.x)
     if both_move:
         drift = 0.5 * (at_a.v - at_b.v)  # type: ignore[operator]
         held = jnp.where(at_end, 0.5 * (dt - jnp.maximum(a.flight.t0, b.flight.t0)), 0.0)
-        shift = held[None] * drift
-    else:
-        shift = drift
+        mid_shift = held[None] * drift
 
     def each(normal, point, gap):
+        shift = mid_shift if both_move else jnp.where(at_end, 0.5 * gap, 0.0)[None] * normal
         arm_a, arm_b = point - at_a.x + shift, point - at_b.x - shift
         return Strikes(
             active=gap < 0, s=s, gap=gap, normal=normal, arm_a=arm_a, arm_b=arm_b,
             K=effective_matrix(at_a, arm_a, at_b, arm_b), v_rel=relative_velocity(at_a, arm_a, at_b, arm_b),
-            push=dot(normal, pulled), drift=drift,
+            pull=pull, drift=drift,
         )  # fmt: skip
 
     return replace(jax.vmap(each)(contacts.normal, contacts.point, contacts.gap), active=active)

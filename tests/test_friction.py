@@ -1,0 +1,87 @@
+"""Sustained contact in closed form: sliding to rest, slopes, slipping that turns into rolling, balls that touch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_form import vector
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+
+G = 9.81
+
+
+def floor(slope=0.0):
+    return dr.Static(dr.HalfSpace(normal=vector(-jnp.sin(slope), jnp.cos(slope)), offset=0.0))
+
+
+def block(mu, v, slope, t, rate):
+    """Distance up the slope at t of a block that starts there with speed v along it."""
+    up, normal = vector(jnp.cos(slope), jnp.sin(slope)), vector(-jnp.sin(slope), jnp.cos(slope))
+    body = dr.Body(dr.Box(half=(0.5, 0.5)), mass=1.3, x=0.5 * normal, angle=slope, v=v * up)
+    world, state = dr.scene({"block": body, "floor": floor(slope)}, gravity=(0.0, -G), friction=mu)
+    times = jnp.stack([jnp.zeros_like(t), t])
+    return dr.rollout(world, state, dt=1 / rate, times=times, substeps=(rate,)).state.x[-1, 0] @ up
+
+
+def block_in_closed_form(mu, v, slope, t):
+    braking, pull = mu * G * jnp.cos(slope), -G * jnp.sin(slope)
+    stop = v / (braking - pull)  # on its way up
+    up = jnp.minimum(t, stop)
+    way = v * up - 0.5 * (braking - pull) * up**2
+    return way + 0.5 * jnp.minimum(pull + braking, 0.0) * (t - up) ** 2
+
+
+@pytest.mark.parametrize(
+    ("case", "rate", "value", "slope"),
+    [
+        # (mu, v, angle) and the errors allowed of the distance after 1 s, and of its slopes
+        ((0.3, 5.0, 0.0), 60, 1e-12, 1e-9),  # still moving
+        ((0.3, 1.0, 0.0), 240, 1e-9, 1e-4),  # stopped within a step
+        ((0.3, 1.0, 0.0), 60, 1e-8, 3e-4),
+        ((0.3, 0.0, 0.2), 60, 1e-12, 1e-9),  # held below tan(angle) = mu
+        ((0.3, 0.0, 0.35), 60, 1e-12, 1e-9),  # slides above
+    ],
+)
+def test_block_on_a_slope(case, rate, value, slope):
+    p = tuple(map(jnp.asarray, (*case, 1.0)))
+    distance, slopes = jax.value_and_grad(block, (0, 1, 2, 3))(*p, rate)
+    expected, true_slopes = jax.value_and_grad(block_in_closed_form, (0, 1, 2, 3))(*p)
+    assert_allclose(distance, expected, atol=value)
+    if case[1] == 0.0:  # at the start on the switch from rest to slip: only the slopes by mu and the angle exist
+        slopes, true_slopes = (slopes[0], slopes[2]), (true_slopes[0], true_slopes[2])
+    assert_allclose(slopes, true_slopes, atol=slope)
+
+
+@pytest.mark.parametrize("rate", [60, 240])
+def test_ball_slips_then_rolls(rate):
+    """A disc thrown along the floor without spin: rolls at 2/3 of its speed from v / (3 mu g) on, whatever mu."""
+
+    def end(mu, v, t):
+        body = dr.Body(dr.Disc(radius=0.5), mass=1.0, x=vector(0.0, 0.5), v=vector(v, 0.0))
+        world, state = dr.scene({"ball": body, "floor": floor()}, gravity=(0.0, -G), friction=mu)
+        times = jnp.stack([jnp.zeros_like(t), t])
+        last = jax.tree.map(
+            lambda leaf: leaf[-1], dr.rollout(world, state, dt=1 / rate, times=times, substeps=(rate,)).state
+        )
+        return jnp.stack([last.x[0, 0], last.v[0, 0], last.w[0, 0]])
+
+    def expected(mu, v, t):
+        rolls = v / (3 * mu * G)
+        speed = 2 * v / 3
+        return jnp.stack([v * rolls - 0.5 * mu * G * rolls**2 + speed * (t - rolls), speed, -speed / 0.5])
+
+    p = tuple(map(jnp.asarray, (0.3, 3.0, 1.0)))
+    assert_allclose(end(*p), expected(*p), atol=1e-12)
+    assert_allclose(jax.jacfwd(end, (0, 1, 2))(*p), jax.jacfwd(expected, (0, 1, 2))(*p), atol=1e-9)
+
+
+def test_cradle_of_touching_balls():
+    """Five that touch, struck by a sixth: the last flies off, the others stay."""
+    bodies = {f"b{k}": dr.Body(dr.Disc(radius=0.5), mass=1.0, x=(1.0 * k, 0.0)) for k in range(5)}
+    bodies["cue"] = dr.Body(dr.Disc(radius=0.5), mass=1.0, x=(-3.0, 0.0), v=(2.0, 0.0))
+    world, state = dr.scene(bodies, restitution=1.0)
+    end = dr.rollout(world, state, dt=1 / 60, steps=120).state
+    assert_allclose(end.v[-1], np.eye(6)[4][:, None] * [2.0, 0.0], atol=1e-9)
+    assert_allclose(end.x[-1, :, 0], [0.0, 1.0, 2.0, 3.0, 6.0, -1.0], atol=1e-8)
