@@ -34,6 +34,7 @@ from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
 IMPACT, HOLD, PUSH = 0, 1, 2
+CREEP = 1e-6  # [m/s] of a slip that is none
 
 
 @pytree
@@ -228,9 +229,11 @@ def _stopping_early(strikes: Strikes, P: Array, mu: Array, T: Array) -> Array:
     speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     size, bound = jax.vmap(norm)(in_all(friction)), in_all(mu * jax.vmap(dot)(n, P))
-    share = safe_divide(speed * size, at_end_speed * bound + size * (speed - along))  # tau / T
-    stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0)
-    lost = 0.5 * T * (1.0 - jnp.clip(share, 0.0, 1.0)) * safe_divide(own, at_end_speed)
+    whole = jnp.where(speed > CREEP, at_end_speed * bound + size * (speed - along), 0.0)
+    share = safe_divide(speed * size, whole)  # tau / T
+    stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0) & (speed > CREEP)
+    per_speed = safe_divide(own, jnp.where(stops, at_end_speed, 0.0))
+    lost = 0.5 * T * (1.0 - jnp.clip(share, 0.0, 1.0)) * per_speed
     return jnp.where(stops[:, None], -lost[:, None] * slip, 0.0)
 
 
