@@ -29,7 +29,7 @@ from diffrigid.contact.sides import at_colliders, body_sides, same_bodies, side_
 from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
 from diffrigid.flight import Flight, orientation, position, state_at
 from diffrigid.joints import islands, linkage
-from diffrigid.numerics import dot, norm, rows, safe_divide
+from diffrigid.numerics import constant, dot, norm, rows, safe_divide
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
@@ -202,11 +202,27 @@ def _apply(
     q, mobility = _posed(world, flight, t)
     P = solve_impulses(strikes, target, mu, mobility, own[:, 0])
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    early = velocities(mobility, *momentum_changes(strikes, _stopping_early(strikes, P, mu, held_for), moving))
+    early_P = _stopping_early(strikes, P, mu, held_for)
+    early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
-    # A displacement P / m moves the angular momentum about the origin by P x v: both bodies give back half of it.
-    _, kept = momentum_changes(replace(strikes, arm_a=strikes.drift, arm_b=-strikes.drift), P, moving)
-    return _anchored(anchors, flight, t, q, count > 0, (kick * dv, kick * dL + (1.0 - kick) * kept), moved)
+    kept = _keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
+    kept = kept + _keeping_spin(strikes, _drift_after(strikes, dv), early_P, moving)
+    return _anchored(anchors, flight, t, q, count > 0, (kick * dv, kick * dL + kept), moved)
+
+
+def _keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array:
+    """Changes of L (N, A, *batch) that go with displacements P / m of two bodies of which one drifts from the other.
+
+    They move the angular momentum about the origin by P x (v_a - v_b): both bodies give back half of it.
+    """
+    return momentum_changes(replace(strikes, arm_a=drift, arm_b=-drift), P, moving)[1]
+
+
+def _drift_after(strikes: Strikes, dv: Array) -> Array:
+    """Half the velocity of a against b after changes dv of the bodies (N, D, *batch), 0 at a static; (C, D, *batch)."""
+    both = constant(tuple(float(max(pair) < len(dv)) for pair in zip(strikes.a, strikes.b, strict=True)), str(dv.dtype))
+    change = 0.5 * (at_colliders(dv, strikes.a, 0.0) - at_colliders(dv, strikes.b, 0.0))
+    return strikes.drift + both.reshape(-1, *[1] * (dv.ndim - 1)) * change
 
 
 def _stopping_early(strikes: Strikes, P: Array, mu: Array, T: Array) -> Array:
