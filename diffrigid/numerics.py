@@ -38,6 +38,20 @@ def unit_vector(like: Array, axis: int) -> Array:
     return (lax.broadcasted_iota(np.int32, like.shape, 0) == axis % like.shape[0]).astype(like.dtype)
 
 
+def components(*parts: Array) -> Array:
+    """Numbers (*batch) as the components of a vector, (D, *batch).
+
+    By choice and not by `jnp.stack`: XLA on a CPU does not vectorise a loop that concatenates, and a cross product
+    took ten times as long.
+    """
+    alike = jnp.broadcast_arrays(*parts)
+    index = lax.broadcasted_iota(np.int32, (len(parts), *alike[0].shape), 0)
+    vector = jnp.broadcast_to(alike[-1][None], index.shape)
+    for k in range(len(parts) - 2, -1, -1):
+        vector = jnp.where(index == k, alike[k][None], vector)
+    return vector
+
+
 def rows(values: Array, index: tuple) -> Array:
     """values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples.
 

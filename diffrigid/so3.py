@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.numerics import cos_sin, dot, safe_sqrt
+from diffrigid.numerics import components, cos_sin, dot, safe_sqrt
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
@@ -16,7 +16,9 @@ SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
 
 def cross(w: Array, r: Array) -> Array:
     """w x r: velocity of a point at r on a body that spins with w."""
-    return jnp.stack([w[1] * r[2] - w[2] * r[1], w[2] * r[0] - w[0] * r[2], w[0] * r[1] - w[1] * r[0]])
+    w_next, w_last = components(w[1], w[2], w[0]), components(w[2], w[0], w[1])
+    r_next, r_last = components(r[1], r[2], r[0]), components(r[2], r[0], r[1])
+    return w_next * r_last - w_last * r_next
 
 
 moment = cross  # r x F: torque of a force F at r
@@ -38,11 +40,17 @@ def unrotate(q: Array, r: Array) -> Array:
 
 def compose(q: Array, p: Array) -> Array:
     """First p, then q; brought back to unit length, so that rounding does not accumulate."""
-    product = jnp.concatenate(
-        [(q[0] * p[0] - dot(q[1:], p[1:]))[None], q[:1] * p[1:] + p[:1] * q[1:] + cross(q[1:], p[1:])]
-    )
+    product = _product(q, p)
     # One Newton step for 1 / |q| about 1: exact to rounding for products of unit quaternions.
     return product * (1.5 - 0.5 * dot(product, product))[None]
+
+
+def _product(q: Array, p: Array) -> Array:
+    """The quaternion product q p, (4, *batch)."""
+    i = components(-p[1], p[0], -p[3], p[2])
+    j = components(-p[2], p[3], p[0], -p[1])
+    k = components(-p[3], -p[2], p[1], p[0])
+    return q[:1] * p + q[1:2] * i + q[2:3] * j + q[3:] * k
 
 
 def exp(phi: Array) -> Array:
@@ -53,7 +61,7 @@ def exp(phi: Array) -> Array:
     cosine, sine = cos_sin(half)
     s = jnp.where(small, 1.0 - square / 8.0, cosine)
     scale = jnp.where(small, 0.5 - square / 48.0, 0.5 * sine / half)
-    return jnp.concatenate([s[None], scale[None] * phi])
+    return components(s, *(scale[None] * phi))
 
 
 def turn_by(phi: Array, q: Array) -> Array:
@@ -74,7 +82,7 @@ def log(q: Array) -> Array:
 
 def matrix_product(m: Array, r: Array) -> Array:
     """(3, 3, *batch) times (3, *batch), in components."""
-    return jnp.stack([dot(m[0], r), dot(m[1], r), dot(m[2], r)])
+    return m[:, 0] * r[:1] + m[:, 1] * r[1:2] + m[:, 2] * r[2:]
 
 
 def inverse_inertia(inertia: Array) -> Array:
@@ -160,12 +168,12 @@ def turn_rate(phi: Array, w: Array) -> Array:
 
 def rate(w: Array, q: Array) -> Array:
     """dq/dt of a body that turns with w in world axes, (4, *batch) [1/s]."""
-    return 0.5 * jnp.concatenate([-dot(w, q[1:])[None], q[:1] * w + cross(w, q[1:])])
+    return 0.5 * _product(components(jnp.zeros_like(w[0]), *w), q)
 
 
 def difference(q: Array, p: Array) -> Array:
     """p as seen from q: the rotation after which q brings to p."""
-    return compose(jnp.concatenate([q[:1], -q[1:]]), p)
+    return compose(components(q[0], *-q[1:]), p)
 
 
 def sine(q: Array) -> Array:
@@ -187,4 +195,4 @@ def tangents(n: Array) -> list[Array]:
     sign = jnp.where(z < 0, -1.0, 1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    return [jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x]), jnp.stack([b, sign + y * y * a, -y])]
+    return [components(1.0 + sign * x * x * a, sign * b, -sign * x), components(b, sign + y * y * a, -y)]

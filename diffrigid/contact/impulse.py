@@ -22,6 +22,7 @@ from jax import Array
 
 from diffrigid.contact.sides import Placed
 from diffrigid.numerics import dot, safe_divide, safe_sqrt
+from diffrigid.so2 import perp
 from diffrigid.so3 import tangents
 from diffrigid.state import rotations
 
@@ -73,14 +74,12 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
     gained = sum(Q[i] * k[i][j] * Q[j] for i in axes for j in axes)
     kappa = _within_energy(0.5 * gamma * (v_n + target), sum(Q[i] * after[i] for i in axes), gained)
     P = [gamma + kappa * Q[0], *(kappa * Q_t for Q_t in Q[1:])]
-    return jnp.stack([sum(P[i] * basis[i][p] for i in axes) for p in axes])
+    return sum(P[i][None] * basis[i] for i in axes)
 
 
-def _contact_frame(n: Array) -> list[list[Array]]:
-    """Components of n and of the unit tangents."""
-    if n.shape[0] == 2:
-        return [[n[0], n[1]], [-n[1], n[0]]]
-    return [list(n), *map(list, tangents(n))]
+def _contact_frame(n: Array) -> list[Array]:
+    """n and its unit tangents."""
+    return [n, perp(n)] if n.shape[0] == 2 else [n, *tangents(n)]
 
 
 def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array) -> list:
