@@ -5,7 +5,7 @@ Every function takes the name of the argument first, for its messages. Known val
 """
 
 import difflib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -193,6 +193,23 @@ def _inertia(where: str, value: Any, dim: int) -> Numbers:
             "as for any distribution of mass; check the order and the units."
         )
     return array
+
+
+def by_name(what: str, records: Any, taken: Iterable[str]) -> dict[str, Any]:
+    """Forces or joints (`what`) by name: as given, or the class in lower case, numbered from the second on."""
+    if not isinstance(records, Mapping):
+        if isinstance(records, str) or not isinstance(records, Sequence):
+            raise ValueError(f"{what} is {records!r}: expected a sequence or a dict of {what}; add brackets.")
+        kinds = [type(record).__name__.lower() for record in records]
+        later = [kinds[:i].count(kind) for i, kind in enumerate(kinds)]
+        records = {k + (str(i) if i else ""): r for k, i, r in zip(kinds, later, records, strict=True)}
+    for name in records:
+        if not isinstance(name, str) or not name or "." in name or name in taken:
+            raise ValueError(
+                f"{what}: {name!r} is no name, or is taken: expected a string without dots that no body, force or "
+                "joint has; choose another."
+            )
+    return dict(records)
 
 
 def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:

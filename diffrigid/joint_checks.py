@@ -16,7 +16,9 @@ from diffrigid.shapes import traced
 from diffrigid.state import rotations
 
 
-def joints_of(joints: Any, moving: Sequence[str], still: Sequence[str], x: Any, q: Any, dim: int) -> tuple:
+def joints_of(
+    joints: Mapping[str, Any], moving: Sequence[str], still: Sequence[str], x: Any, q: Any, dim: int
+) -> tuple:
     """Joints of one kind in one record each, and their names.
 
     Args:
@@ -26,12 +28,6 @@ def joints_of(joints: Any, moving: Sequence[str], still: Sequence[str], x: Any, 
         ValueError: a joint between two statics, with unknown names, with an axis of no length, or with anchors
             that do not meet at the start.
     """
-    if not isinstance(joints, Mapping):
-        if isinstance(joints, str) or not isinstance(joints, Sequence):
-            raise ValueError(f"joints is {joints!r}: expected a sequence or a dict of joints; add brackets.")
-        kinds = [type(joint).__name__.lower() for joint in joints]
-        later = [kinds[:i].count(kind) for i, kind in enumerate(kinds)]
-        joints = {k + (str(i) if i else ""): j for k, i, j in zip(kinds, later, joints, strict=True)}
     colliders = [*moving, *still]
     groups: dict[Any, list[tuple[str, Any]]] = {}
     for name, joint in joints.items():

@@ -14,6 +14,7 @@ from diffrigid.contact import Contact
 from diffrigid.convert import (
     Solid,
     angular_velocity,
+    by_name,
     coefficient,
     force_of,
     fraction,
@@ -110,8 +111,9 @@ def scene(
     moving, still = _sorted(bodies)
     everything: dict[str, Body | Static] = {**moving, **still}
     dim, n = _dimension(moving, gravity), len(moving)
-    ends, joint_records = _joints(joints, moving, still, dim)
-    passing = _passing([*ignore, *ends], list(everything))
+    named_forces = _forces(forces, gravity, everything, moving, dim)
+    joined, linked, joint_names = _joints(joints, named_forces, moving, still, dim)
+    passing = _passing([*ignore, *joined], list(everything))
     shapes = {k: None if b.shape is None else shape_of(k, b.shape, dim) for k, b in everything.items()}
     solids = {name: solid_of(shapes[name], dim) for name in moving}
     records, offsets, owners = _stack_shapes(shapes, solids, dim)
@@ -120,13 +122,12 @@ def scene(
     e, own_e = _material("restitution", everything, restitution)
     mu, own_mu = _material("friction", everything, friction)
     mass, inertia = zip(*(mass_and_inertia(k, b, solids[k], dim) for k, b in moving.items()), strict=True)
-    named_forces = _forces(forces, gravity, moving, still, dim)
     made = World(
         bodies=Bodies(mass=stack(mass), inertia=stack(inertia), restitution=e[:n], friction=mu[:n], dim=dim),
         statics=Statics(**_poses(still, dim), restitution=e[n:], friction=mu[n:]),
         shapes=records, offsets=offsets, owners=owners, pairs=pairs,
         forces=tuple(named_forces.values()), force_names=tuple(named_forces),
-        joints=joint_records[0], joint_names=joint_records[1],
+        joints=linked, joint_names=joint_names,
         contact=_contact(Contact() if contact is None else contact),
         names=tuple(moving), static_names=tuple(still), own_restitution=own_e, own_friction=own_mu,
     )  # fmt: skip
@@ -247,33 +248,22 @@ def _count(shape_a: Any, shape_b: Any, dim: int) -> int:
     return contacts.gap.shape[0]
 
 
-def _forces(forces: Any, gravity: Any, moving: Mapping, still: Mapping, dim: int) -> dict[str, Any]:
+def _forces(forces: Any, gravity: Any, colliders: Mapping, moving: Mapping, dim: int) -> dict[str, Any]:
     """All forces by name."""
-    named: dict[str, Any] = {} if gravity is None else {"gravity": Gravity(g=numbers("gravity", gravity, (dim,)))}
-    if not isinstance(forces, Mapping):
-        if isinstance(forces, str) or not isinstance(forces, Sequence):
-            raise ValueError(f"forces is {forces!r}: expected a sequence or a dict of forces; add brackets.")
-        kinds = [type(force).__name__.lower() for force in forces]
-        later = [kinds[:i].count(kind) for i, kind in enumerate(kinds)]
-        forces = {k + (str(i) if i else ""): f for k, i, f in zip(kinds, later, forces, strict=True)}
-    for name, force in forces.items():
-        taken = name in (*named, *moving, *still, *RESERVED)
-        if taken or not isinstance(name, str) or not name or "." in name:
-            raise ValueError(
-                f"forces: {name!r} is no name, or is taken: expected a string without dots that no body or "
-                "other force has; choose another."
-            )
-        named[name] = force_of(name, force, list(moving), dim)
-    return named
+    made: dict[str, Any] = {} if gravity is None else {"gravity": Gravity(g=numbers("gravity", gravity, (dim,)))}
+    for name, force in by_name("forces", forces, (*made, *colliders, *RESERVED)).items():
+        made[name] = force_of(name, force, list(moving), dim)
+    return made
 
 
-def _joints(joints: Any, moving: Mapping, still: Mapping, dim: int) -> tuple[list[tuple[str, str]], tuple]:
+def _joints(joints: Any, named: Mapping, moving: Mapping, still: Mapping, dim: int):
     """Pairs of names of the colliders that are joined, and the joints of a world with their names."""
-    poses = _poses({**moving, **still}, dim)
+    colliders, poses = {**moving, **still}, _poses({**moving, **still}, dim)
+    joints = by_name("joints", joints, (*named, *colliders, *RESERVED))
     records, names = joints_of(joints, list(moving), list(still), poses["x"], poses["q"], dim)
-    colliders = [*moving, *still, None]
-    joined = [(colliders[a], colliders[b]) for group in records for a, b in zip(group.a, group.b, strict=True)]
-    return [(a, b) for a, b in joined if a is not None and b is not None], (records, names)
+    ends = [*colliders, None]
+    joined = [(ends[a], ends[b]) for group in records for a, b in zip(group.a, group.b, strict=True)]
+    return [(a, b) for a, b in joined if a is not None and b is not None], records, names
 
 
 def _contact(contact: Any) -> Contact:

@@ -220,6 +220,7 @@ MISTAKES = {
     "apart": (r"revolute does not hold at the start: it is off by 0\.5 .*move a body", dr.Revolute("arm", anchor_a=(0.0, 0.0), anchor_b=(1.0, 0.5))),
     "axis": (r"prismatic\.axis_b has no length", dr.Prismatic("arm", axis_b=(0.0, 0.0))),
     "shape": (r"revolute\.anchor_a has shape \(3,\)", dr.Revolute("arm", anchor_a=(0.0, 0.0, 0.0))),
+    "name": (r"joints: 'arm' is no name, or is taken", {"arm": dr.Ball("arm", anchor_a=(0.0, 0.0))}),
     "kind": (r"joints: 'float' is 3\.0: expected one of Revolute", 3.0),
 }  # fmt: skip
 
@@ -228,7 +229,7 @@ MISTAKES = {
 def test_mistakes_are_named_with_their_fix(name):
     message, joint = MISTAKES[name]
     with pytest.raises(ValueError, match=message):
-        dr.scene(ARM, joints=[joint])
+        dr.scene(ARM, joints=joint if isinstance(joint, dict) else [joint])
 
 
 def test_a_start_that_tears_a_joint_is_reported():

@@ -1,56 +1,34 @@
 """Impacts of round shapes that are alone on their bodies: the usual step of a world of many discs or spheres.
 
 The general pass evaluates every contact of every pair. Here only the *times* are found for all pairs, without
-derivative, and each body keeps its next one. The next few impacts of each world are then gathered into slots,
-and only these are evaluated. A slot takes its two bodies by a product with zeros and ones, summed over the
-bodies, which unlike a gather along the batch is vectorised, in both directions.
+derivative, and each body keeps its next one. The next few impacts of each world then go into `slots`, and only
+these are evaluated.
 
 A pass goes this way if it is an impact pass and, in all worlds of the batch, no body is in two contacts at the
 same time, none comes to rest, and the slots suffice; else the general way, to the same result.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.collide import PairGroup
-from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
-from diffrigid.contact.impulse import impulses
-from diffrigid.contact.resting import Strikes
-from diffrigid.contact.sides import Side, side_of
-from diffrigid.contact.strikes import MATERIALS, Material, material, mixed, relative_path_is_straight, strikes_of
-from diffrigid.flight import Flight, orientation, position, velocity
+from diffrigid.contact.sides import Side
+from diffrigid.contact.slots import Slots, Table, fold, sides_of_table, summed
+from diffrigid.contact.strikes import Material, material, mixed, relative_path_is_straight
+from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
-from diffrigid.numerics import apart, constant, dot, pack, safe_sqrt
-from diffrigid.pytree import replace
+from diffrigid.numerics import apart, constant, dot, safe_sqrt
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
 RESTS = -1e30  # [s] stands for an impact after which bodies stay together
 CROWDED = 4  # pairs per body from which this way is faster than the list of pairs
 SHARE = 4  # bodies for each slot
-
-
-class Table(NamedTuple):
-    """The pairs of one kind: all N bodies against each other, or against B statics."""
-
-    pairs: PairGroup
-    rows_a: tuple[int, ...]  # of world.shapes, for each body
-    rows_b: tuple[int, ...]  # for each body, or each static
-    b: tuple[int, ...]  # colliders: the bodies, or the statics
-    allowed: tuple[tuple[float, ...], ...]  # (N, N or B): 1 if these two can meet, else 0
-
-
-class Slots(NamedTuple):
-    """E impacts of each world, or fewer, as weights 0 or 1; at most one in all rows of a slot."""
-
-    a: Array  # (E, N, *batch) body a
-    b: tuple[Array, ...]  # for each table (E, N or B, *batch) the other side; all 0 if the slot is not of its kind
 
 
 def is_crowded(world: Any) -> bool:
@@ -117,13 +95,13 @@ def _soonest(live: Array, world: Any, table: Table, flight: Flight, since: Array
     Returns:
         (N, *batch) of each body the first and, against statics, the second; (B, *batch) of each static the first.
     """
-    a, b = _sides(world, table, flight, since)
+    a, b = sides_of_table(world, table, flight, since)
     if table.b[0] < a.flight.t0.shape[0]:
         times = apart(live, functools.partial(_times_of_pairs, world, table), a, since, dt)
-        least = apart(live, functools.partial(_fold, jnp.minimum, axis=1), times)
+        least = apart(live, functools.partial(fold, jnp.minimum, axis=1), times)
         return least, jnp.full_like(least, jnp.inf), None
     times = apart(live, functools.partial(_times_to_statics, world, table), a, b, dt)
-    return *apart(live, _two_smallest, times), apart(live, functools.partial(_fold, jnp.minimum, axis=0), times)
+    return *apart(live, _two_smallest, times), apart(live, functools.partial(fold, jnp.minimum, axis=0), times)
 
 
 def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Array) -> Array:
@@ -201,7 +179,7 @@ def _slots(live: Array, moving: int, tables: tuple, soonest: list, first: Array,
         return [(now & (least[None] == s[:, None])).astype(s.dtype) for least, *_ in soonest]
 
     bodies = apart(live, taking_part, soonest, first, s)
-    counts = apart(live, lambda bodies: [_sum(now) for now in bodies], bodies)
+    counts = apart(live, lambda bodies: [summed(now) for now in bodies], bodies)
     total, void = sum(counts), jnp.zeros_like(s, bool)
     fine = total == 0
     for table, n in zip(tables, counts, strict=True):
@@ -212,7 +190,7 @@ def _slots(live: Array, moving: int, tables: tuple, soonest: list, first: Array,
 
     def lowest(now, n):
         number = lax.broadcasted_iota(s.dtype, now.shape, 1)
-        return jnp.where(n == 2, _fold(jnp.minimum, jnp.where(now > 0, number, moving), 1), moving)
+        return jnp.where(n == 2, fold(jnp.minimum, jnp.where(now > 0, number, moving), 1), moving)
 
     def weights(soonest, bodies, counts, lowest, s):
         of_a, of_b = 0.0, []
@@ -233,94 +211,11 @@ def _slots(live: Array, moving: int, tables: tuple, soonest: list, first: Array,
     return apart(live, weights, soonest, bodies, counts, firsts, s), ~jnp.all(fine) | jnp.any(near)
 
 
-class Blow(NamedTuple):
-    """The impact in each slot."""
-
-    on: Array  # (E, *batch) 1 or 0
-    strike: Strikes  # (E, ...)
-    e: Array  # (E, *batch) [-]
-    mu: Array  # (E, *batch) [-]
-
-
-def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, launch: Any, dt: Array) -> Anchors:
-    """The anchors after the impacts in the slots."""
-    flight, so, live = launch(anchors.state, anchors.t0), rotations(world.dim), jnp.any(dt > 0)
-    moving, count = len(world.names), slots.a.shape[0]
-    movers = [b for table, b in zip(tables, slots.b, strict=True) if table.b[0] < moving]
-    weights = jnp.concatenate([slots.a, *movers])  # a of all slots, then b of all slots
-    body, _ = _sides(world, tables[0], flight, anchors.since)
-    columns, unpack = pack((body, _materials(world, tuple(range(moving)))), dt.ndim)
-    columns = _pick(live, weights, columns)
-    columns_a, columns_b = [c[:count] for c in columns], [c[count:] for c in columns]
-
-    def blow(unpack_b: Callable, columns_a: list, columns_b: list, there: Array) -> Blow:
-        (a, own), (b, others) = unpack(columns_a), unpack_b(columns_b)
-        strike = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, b)
-        strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, pull=None, drift=None))
-        return Blow(_sum(there) * strike.active.astype(dt.dtype), strike, *map(mixed, own, others))
-
-    def impulse(blows: list[Blow]) -> tuple:
-        one, *others = blows
-        for other in others:
-            one = jax.tree.map(functools.partial(_where, other.on > 0), other, one)
-        on, k, e, mu = one
-        P = impulses(on > 0, k.K, k.normal, k.v_rel, -e * jax.vmap(dot)(k.normal, k.v_rel), mu)
-        return on, k.s, P, k.arm_a, k.arm_b
-
-    def end(columns: list, t: Array, P: Array, arm: Array) -> tuple:
-        f = unpack(columns)[0].flight
-        q = jax.vmap(orientation)(f, t)
-        return jax.vmap(struck)(f, t, q, f.inverse_mass[:, None] * P, jax.vmap(so.moment)(arm, P)), t
-
-    def put(weights: Array, columns: list) -> list:
-        return [_weighted_sum(weights, column, 0) for column in columns]
-
-    blows = []
-    for table, there in zip(tables, slots.b, strict=True):
-        if table.b[0] < moving:
-            blows.append(apart(live, functools.partial(blow, unpack), columns_a, columns_b, there))
-        else:
-            static, unpack_static = pack(_static(world, table, flight, anchors.since), dt.ndim)
-            static = _pick(live, there, static)
-            blows.append(apart(live, functools.partial(blow, unpack_static), columns_a, static, there))
-    on, t, P, arm_a, arm_b = apart(live, impulse, blows)
-    if movers:
-        on, t, P, arm = (jnp.concatenate(pair) for pair in ((on, on), (t, t), (P, -P), (arm_a, arm_b)))
-    else:
-        arm = arm_a
-    after, unpack_after = pack(apart(live, end, columns, t, P, arm), dt.ndim)
-    weights = apart(live, lambda weights, on: weights * on[:, None], weights, on)
-    state, t = unpack_after(apart(live, put, weights, after))
-    hit = _fold(jnp.add, weights, 0) > 0
-    old = (anchors.state, anchors.t0, anchors.since)
-    state, t0, since = jax.tree.map(functools.partial(_where, hit), (state, t, t), old)
-    return Anchors(state=state, t0=t0, since=since)
-
-
-def _static(world: Any, table: Table, flight: Flight, since: Array) -> tuple:
-    """The statics of a table, and their materials."""
-    return _sides(world, table, flight, since)[1], _materials(world, table.b)
-
-
-def _materials(world: Any, colliders: tuple[int, ...]) -> list[Material]:
-    return [material(world, name, colliders) for name in MATERIALS]
-
-
-def _sides(world: Any, table: Table, flight: Flight, since: Array) -> tuple[Side, Side]:
-    a = side_of(world, flight, since, table.pairs.shape_a, table.rows_a, tuple(range(len(table.rows_a))))
-    return a, side_of(world, flight, since, table.pairs.shape_b, table.rows_b, table.b)
-
-
-def _where(chosen: Array, new: Array, old: Array) -> Array:
-    """Choice by the leading axis and the batch: (M, *batch), (M, ..., *batch)."""
-    return jnp.where(lax.expand_dims(chosen, range(1, 1 + new.ndim - chosen.ndim)), new, old)
-
-
 def _in_order(first: Array, count: int) -> Array:
     """The `count` least different values of (N, *batch) over the bodies, ascending; inf where there are fewer."""
 
     def following(s, _):
-        s = _fold(jnp.minimum, jnp.where(first > s[None], first, jnp.inf), 0)
+        s = fold(jnp.minimum, jnp.where(first > s[None], first, jnp.inf), 0)
         return s, s
 
     return lax.scan(following, jnp.full_like(first[0], -jnp.inf), None, length=count)[1]
@@ -332,57 +227,3 @@ def _two_smallest(table: Array) -> tuple[Array, Array]:
     for k in range(1, table.shape[1]):
         least, following = jnp.minimum(least, table[:, k]), jnp.minimum(following, jnp.maximum(least, table[:, k]))
     return least, following
-
-
-def _sum(weights: Array) -> Array:
-    """(E, A, *batch) to (E, *batch)."""
-    return _fold(jnp.add, weights, 1)
-
-
-def _fold(op: Any, table: Array, axis: int) -> Array:
-    """Reduction over one axis in front of the batch. Written out: XLA's own is slow."""
-    return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
-
-
-def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
-    """Of A rows, for each of E slots that one of weight 1 (E, A, *batch); the first where there is none."""
-
-    def filled(weights, total):
-        first = lax.broadcasted_iota(weights.dtype, weights.shape, 1) == 0
-        return jnp.where(first, weights + (1.0 - total)[:, None], weights)
-
-    def pick(weights, columns):
-        return [_weighted_sum(weights, column, 1) for column in columns]
-
-    weights = apart(live, filled, weights, apart(live, _sum, weights))
-    return apart(live, pick, weights, columns)
-
-
-def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
-    """Sum over one of the two axes of constant weights (A, B, *batch) times values (A or B, F, *batch) along it.
-
-    Its transpose is the sum over the other axis, and is given as that: JAX's own would add up one padded term
-    after the other. `custom_linear_solve` is the way to state a transpose that all transformations know.
-    """
-    size, batch = max(weights.shape[:2]), weights.shape[2:]
-
-    def filled(values):
-        values = jnp.broadcast_to(values, values.shape[:2] + batch)
-        return jnp.pad(values, [(0, size - values.shape[0]), *[(0, 0)] * (values.ndim - 1)])
-
-    def along(axis):
-        return lambda _, values: filled(_sum_of_terms(weights, values[: weights.shape[axis]], axis))
-
-    total = lax.custom_linear_solve(lambda values: values, filled(values), along(axis), along(1 - axis))
-    return total[: weights.shape[1 - axis]]
-
-
-def _sum_of_terms(weights: Array, values: Array, axis: int) -> Array:
-    # Term by term: XLA's own reduction of such a product takes twice the time.
-    def add(total, term):
-        k, value = term
-        weight = lax.dynamic_index_in_dim(weights, k, axis, keepdims=False)
-        return total + weight[:, None] * value[None], None
-
-    count, zero = values.shape[0], jnp.zeros((weights.shape[1 - axis], *values.shape[1:]), values.dtype)
-    return lax.scan(add, zero, (jnp.arange(count), values), unroll=min(count, 16))[0]

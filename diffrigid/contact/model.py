@@ -23,9 +23,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
-from diffrigid.contact.isolated import is_crowded, meet, next_impacts, tables_of
+from diffrigid.contact.isolated import is_crowded, next_impacts, tables_of
 from diffrigid.contact.resting import Mobility, Strikes, momentum_changes, solve_impulses, velocities
 from diffrigid.contact.sides import at_colliders, body_sides, same_bodies, side_sum
+from diffrigid.contact.slots import meet
 from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
 from diffrigid.flight import Flight, orientation, position, state_at
 from diffrigid.joints import islands, linkage

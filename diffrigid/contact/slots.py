@@ -1,0 +1,178 @@
+"""Slots: the few impacts of a pass in each world, gathered from its bodies, evaluated, and put back.
+
+A slot takes its two bodies by a product with zeros and ones, summed over the bodies, which unlike a gather along
+the batch is vectorised, in both directions.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.collide import PairGroup
+from diffrigid.contact.anchors import Anchors, struck
+from diffrigid.contact.impulse import impulses
+from diffrigid.contact.resting import Strikes
+from diffrigid.contact.sides import Side, side_of
+from diffrigid.contact.strikes import MATERIALS, Material, material, mixed, strikes_of
+from diffrigid.flight import Flight, orientation
+from diffrigid.numerics import apart, dot, pack
+from diffrigid.pytree import replace
+from diffrigid.state import rotations
+
+
+class Table(NamedTuple):
+    """The pairs of one kind: all N bodies against each other, or against B statics."""
+
+    pairs: PairGroup
+    rows_a: tuple[int, ...]  # of world.shapes, for each body
+    rows_b: tuple[int, ...]  # for each body, or each static
+    b: tuple[int, ...]  # colliders: the bodies, or the statics
+    allowed: tuple[tuple[float, ...], ...]  # (N, N or B): 1 if these two can meet, else 0
+
+
+class Slots(NamedTuple):
+    """E impacts of each world, or fewer, as weights 0 or 1; at most one in all rows of a slot."""
+
+    a: Array  # (E, N, *batch) body a
+    b: tuple[Array, ...]  # for each table (E, N or B, *batch) the other side; all 0 if the slot is not of its kind
+
+
+class Blow(NamedTuple):
+    """The impact in each slot."""
+
+    on: Array  # (E, *batch) 1 or 0
+    strike: Strikes  # (E, ...)
+    e: Array  # (E, *batch) [-]
+    mu: Array  # (E, *batch) [-]
+
+
+def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, launch: Any, dt: Array) -> Anchors:
+    """The anchors after the impacts in the slots."""
+    flight, so, live = launch(anchors.state, anchors.t0), rotations(world.dim), jnp.any(dt > 0)
+    moving, count = len(world.names), slots.a.shape[0]
+    movers = [b for table, b in zip(tables, slots.b, strict=True) if table.b[0] < moving]
+    weights = jnp.concatenate([slots.a, *movers])  # a of all slots, then b of all slots
+    body, _ = sides_of_table(world, tables[0], flight, anchors.since)
+    columns, unpack = pack((body, _materials(world, tuple(range(moving)))), dt.ndim)
+    columns = _pick(live, weights, columns)
+    columns_a, columns_b = [c[:count] for c in columns], [c[count:] for c in columns]
+
+    def blow(unpack_b: Callable, columns_a: list, columns_b: list, there: Array) -> Blow:
+        (a, own), (b, others) = unpack(columns_a), unpack_b(columns_b)
+        strike = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, b)
+        strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, pull=None, drift=None))
+        return Blow(summed(there) * strike.active.astype(dt.dtype), strike, *map(mixed, own, others))
+
+    def impulse(blows: list[Blow]) -> tuple:
+        one, *others = blows
+        for other in others:
+            one = jax.tree.map(functools.partial(_where, other.on > 0), other, one)
+        on, k, e, mu = one
+        P = impulses(on > 0, k.K, k.normal, k.v_rel, -e * jax.vmap(dot)(k.normal, k.v_rel), mu)
+        return on, k.s, P, k.arm_a, k.arm_b
+
+    def end(columns: list, t: Array, P: Array, arm: Array) -> tuple:
+        f = unpack(columns)[0].flight
+        q = jax.vmap(orientation)(f, t)
+        return jax.vmap(struck)(f, t, q, f.inverse_mass[:, None] * P, jax.vmap(so.moment)(arm, P)), t
+
+    def put(weights: Array, columns: list) -> list:
+        return [_weighted_sum(weights, column, 0) for column in columns]
+
+    blows = []
+    for table, there in zip(tables, slots.b, strict=True):
+        if table.b[0] < moving:
+            blows.append(apart(live, functools.partial(blow, unpack), columns_a, columns_b, there))
+        else:
+            static, unpack_static = pack(_static(world, table, flight, anchors.since), dt.ndim)
+            static = _pick(live, there, static)
+            blows.append(apart(live, functools.partial(blow, unpack_static), columns_a, static, there))
+    on, t, P, arm_a, arm_b = apart(live, impulse, blows)
+    if movers:
+        on, t, P, arm = (jnp.concatenate(pair) for pair in ((on, on), (t, t), (P, -P), (arm_a, arm_b)))
+    else:
+        arm = arm_a
+    after, unpack_after = pack(apart(live, end, columns, t, P, arm), dt.ndim)
+    weights = apart(live, lambda weights, on: weights * on[:, None], weights, on)
+    state, t = unpack_after(apart(live, put, weights, after))
+    hit = fold(jnp.add, weights, 0) > 0
+    old = (anchors.state, anchors.t0, anchors.since)
+    state, t0, since = jax.tree.map(functools.partial(_where, hit), (state, t, t), old)
+    return Anchors(state=state, t0=t0, since=since)
+
+
+def _static(world: Any, table: Table, flight: Flight, since: Array) -> tuple:
+    """The statics of a table, and their materials."""
+    return sides_of_table(world, table, flight, since)[1], _materials(world, table.b)
+
+
+def _materials(world: Any, colliders: tuple[int, ...]) -> list[Material]:
+    return [material(world, name, colliders) for name in MATERIALS]
+
+
+def sides_of_table(world: Any, table: Table, flight: Flight, since: Array) -> tuple[Side, Side]:
+    a = side_of(world, flight, since, table.pairs.shape_a, table.rows_a, tuple(range(len(table.rows_a))))
+    return a, side_of(world, flight, since, table.pairs.shape_b, table.rows_b, table.b)
+
+
+def _where(chosen: Array, new: Array, old: Array) -> Array:
+    """Choice by the leading axis and the batch: (M, *batch), (M, ..., *batch)."""
+    return jnp.where(lax.expand_dims(chosen, range(1, 1 + new.ndim - chosen.ndim)), new, old)
+
+
+def summed(weights: Array) -> Array:
+    """(E, A, *batch) to (E, *batch)."""
+    return fold(jnp.add, weights, 1)
+
+
+def fold(op: Any, table: Array, axis: int) -> Array:
+    """Reduction over one axis in front of the batch. Written out: XLA's own is slow."""
+    return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
+
+
+def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
+    """Of A rows, for each of E slots that one of weight 1 (E, A, *batch); the first where there is none."""
+
+    def filled(weights, total):
+        first = lax.broadcasted_iota(weights.dtype, weights.shape, 1) == 0
+        return jnp.where(first, weights + (1.0 - total)[:, None], weights)
+
+    def pick(weights, columns):
+        return [_weighted_sum(weights, column, 1) for column in columns]
+
+    weights = apart(live, filled, weights, apart(live, summed, weights))
+    return apart(live, pick, weights, columns)
+
+
+def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
+    """Sum over one of the two axes of constant weights (A, B, *batch) times values (A or B, F, *batch) along it.
+
+    Its transpose is the sum over the other axis, and is given as that: JAX's own would add up one padded term
+    after the other. `custom_linear_solve` is the way to state a transpose that all transformations know.
+    """
+    size, batch = max(weights.shape[:2]), weights.shape[2:]
+
+    def filled(values):
+        values = jnp.broadcast_to(values, values.shape[:2] + batch)
+        return jnp.pad(values, [(0, size - values.shape[0]), *[(0, 0)] * (values.ndim - 1)])
+
+    def along(axis):
+        return lambda _, values: filled(_sum_of_terms(weights, values[: weights.shape[axis]], axis))
+
+    total = lax.custom_linear_solve(lambda values: values, filled(values), along(axis), along(1 - axis))
+    return total[: weights.shape[1 - axis]]
+
+
+def _sum_of_terms(weights: Array, values: Array, axis: int) -> Array:
+    # Term by term: XLA's own reduction of such a product takes twice the time.
+    def add(total, term):
+        k, value = term
+        weight = lax.dynamic_index_in_dim(weights, k, axis, keepdims=False)
+        return total + weight[:, None] * value[None], None
+
+    count, zero = values.shape[0], jnp.zeros((weights.shape[1 - axis], *values.shape[1:]), values.dtype)
+    return lax.scan(add, zero, (jnp.arange(count), values), unroll=min(count, 16))[0]
