@@ -7,7 +7,7 @@ inertia is a number, (*batch). Vectors (2, *batch). World and body rotation rate
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import components, cos_sin, dot
+from diffrigid.numerics import cos_sin, dot
 
 D, A, Q = 2, 1, 2  # components of a vector, of an angular velocity, of an orientation
 
@@ -37,7 +37,7 @@ def compose(q: Array, p: Array) -> Array:
 
 def exp(phi: Array) -> Array:
     """Orientation of the rotation by phi [rad], (1, *batch)."""
-    return components(*(part[0] for part in cos_sin(phi)))
+    return jnp.concatenate(cos_sin(phi))
 
 
 def turn_by(phi: Array, q: Array) -> Array:

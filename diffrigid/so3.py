@@ -16,9 +16,12 @@ SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
 
 def cross(w: Array, r: Array) -> Array:
     """w x r: velocity of a point at r on a body that spins with w."""
-    w_next, w_last = components(w[1], w[2], w[0]), components(w[2], w[0], w[1])
-    r_next, r_last = components(r[1], r[2], r[0]), components(r[2], r[0], r[1])
-    return w_next * r_last - w_last * r_next
+    return _cycle(w * _cycle(r) - _cycle(w) * r)
+
+
+def _cycle(r: Array) -> Array:
+    """(y, z, x)."""
+    return components(r[1], r[2], r[0])
 
 
 moment = cross  # r x F: torque of a force F at r

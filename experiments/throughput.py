@@ -6,12 +6,12 @@ One core; each case in a process of its own, so that compile time and peak memor
 one step of one world, whatever its sub-steps. The native engines (pyb2d3 is Box2D v3) step their worlds in
 turn, from Python; diffrigid steps a batch in one call. pymunk computes in float64, the others in float32. The
 gradient is `value_and_grad` of the sum of squared final positions with respect to all initial velocities; its
-peak memory is that of a process which has run forward before.
+memory is that of the temporaries of the compiled program. Peaks of the process, in the JSON, hold the compiler too.
 
 One sweep a step: a body that is struck twice in 4 ms is repaired in the next step, as the peers do.
 
-2026-11-21, one quiet core of an AMD EPYC (Zen 5): pymunk 1.4e6 (S1), 6.3e5 (S2); Box2D 6.7e5, 2.5e5; diffrigid
-2.3e8 and 7.3e5, that is 163 and 1.15 times pymunk; gradient over forward 6 (S1, 1024 worlds) and 11 (S2).
+2026-11-21, one core of an AMD EPYC (Zen 5): pymunk 1.6e6 (S1), 6.3e5 (S2); Box2D 7.0e5, 2.5e5; diffrigid 1.6e8 to
+1.8e8 and 1.2e6, that is 102 to 117 and 2.0 times pymunk; gradient over forward 5 (S1, 1024 worlds) and 6 (S2).
 """
 
 import argparse
@@ -34,9 +34,9 @@ from pathlib import Path
 DT = 1 / 240  # [s]
 RUNS, MIN_SECONDS = 5, 1.0  # a median is over at least this many runs and this much time, after a warm-up
 PEER_WORLDS, BATCHES = 32, (1024, 4096)  # worlds in a timed run; Box2D holds 128 at most
-HEADER = "scene engine    worlds  steps/s over peer | compile s  gradient | grad/fwd peak MB | sanity"
+HEADER = "scene engine    worlds  steps/s over peer | compile s  gradient | grad/fwd temp MB | sanity"
 ROW = "{rate:8.3g} {over_peer:9.3g} | {compile_s:9.2f} {grad_compile_s:9.2f} | "
-ROW += "{grad_over_forward:8.2f} {grad_peak_rss_mb:7.0f} | "
+ROW += "{grad_over_forward:8.2f} {grad_temp_mb:7.0f} | "
 
 # Frictionless discs of 1 kg, N pairs x and v, between walls (normal, offset) that keep normal . x >= offset.
 # SI units. check(final x, v) -> dict with "ok": did the engine do the same physics? To add a scene: a
@@ -170,7 +170,8 @@ def timed_jit(function, *args):
     seconds = time.perf_counter() - start
     result, row = timed(lambda _: jax.block_until_ready(compiled(*args)))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # [MB] on Linux, kB on macOS
-    return result, row | {"compile_s": seconds, "peak_rss_mb": peak}
+    temporaries = compiled.memory_analysis().temp_size_in_bytes / 1e6
+    return result, row | {"compile_s": seconds, "peak_rss_mb": peak, "temp_mb": temporaries}
 
 
 def timed(run, prepare=lambda: None):
