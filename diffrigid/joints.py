@@ -9,7 +9,8 @@ With J the Jacobian of all errors by the twists (dx, dtheta) of the bodies and M
     J M^-1 J^T lam = -J v                    the impulses that bring velocities onto the joints
     J M^-1 J^T lam = -error                  the displacements that bring poses onto the joints
 
-J and the rate of J v are derivatives of the error function in forward mode.
+J and the rate of J v are derivatives of the error function in forward mode. All of it is differentiable in both
+modes, by anchors, axes and lengths too, except where a rod has no length.
 Source: Witkin, Physically Based Modeling: Constrained Dynamics, SIGGRAPH 1997 course notes, sections 2 to 4.
 """
 
@@ -226,7 +227,7 @@ class Linkage:
 def linkage(joints: tuple, statics: Any, bodies: Bodies, state: State) -> Linkage:
     """Of the joints of a world at these poses."""
     jac = jacobian(joints, statics, bodies, state)
-    matrix = (jac.rows[:, None] * jac.mobile[None]).sum(2)
+    matrix = _mobility(jac)
     count = matrix.shape[0]
     units = jnp.eye(count, dtype=matrix.dtype).reshape(count, count, *[1] * (matrix.ndim - 2)) + jnp.zeros_like(matrix)
     inverse = jax.vmap(lambda unit: solve_symmetric(matrix, unit))(units)
@@ -244,10 +245,14 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
     return moved[:, :D], moved[:, D:], forced[:, D:]
 
 
+def _mobility(jac: Jacobian) -> Array:
+    """J M^-1 J^T, (R, R, *batch)."""
+    return (jac.rows[:, None] * jac.mobile[None]).sum(2)
+
+
 def _multipliers(jac: Jacobian, target: Array) -> Array:
     """lam of J M^-1 J^T lam = -target, (R, *batch)."""
-    matrix = (jac.rows[:, None] * jac.mobile[None]).sum(2)
-    return -solve_symmetric(matrix, target)
+    return -solve_symmetric(_mobility(jac), target)
 
 
 def _columns(jac: Jacobian, lam: Array) -> Array:
@@ -270,7 +275,7 @@ def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wren
 
 
 def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> State:
-    """The state with poses, then velocities, brought onto the joints; momentum is kept."""
+    """The state with poses, then velocities, brought onto the joints, by what joints can do: J^T lam, and no more."""
     so, moving = rotations(bodies.dim), state.x.shape[0]
 
     def split(columns):
