@@ -84,7 +84,7 @@ def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion
     so = rotations(f.dim)
 
     def placed(motion):
-        q = jax.vmap(lambda q, phi: so.compose(q, so.exp(phi)))(f.q, motion.phi)
+        q = jax.vmap(so.turn_in_body)(f.q, motion.phi)
         w = jax.vmap(so.unspin)(f.inverse_inertia, q, motion.L)
         return State(x=motion.x, q=q, v=motion.v, w=w)
 
@@ -147,7 +147,7 @@ def orientation(f: Flight, s: Array) -> Array:
     phi = f.turn[-1]
     for k in range(f.turn.shape[0] - 2, -1, -1):
         phi = f.turn[k] + t * phi
-    return so.compose(f.q, so.exp(t * phi))
+    return so.turn_in_body(f.q, t * phi)
 
 
 def velocity(f: Flight, s: Array) -> Array:

@@ -16,6 +16,9 @@ import numpy as np
 from jax import Array, lax
 
 
+FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
+
+
 @jax.custom_jvp
 def dot(a: Array, b: Array) -> Array:
     """Inner product over the leading axis, (D, *batch), (D, *batch) -> (*batch)."""
@@ -44,11 +47,13 @@ def components(*parts: Array) -> Array:
     By choice and not by `jnp.stack`: XLA on a CPU does not vectorise a loop that concatenates, and a cross product
     took ten times as long.
     """
-    alike = jnp.broadcast_arrays(*parts)
-    index = lax.broadcasted_iota(np.int32, (len(parts), *alike[0].shape), 0)
-    vector = jnp.broadcast_to(alike[-1][None], index.shape)
+    alike = parts if all(part.shape == parts[0].shape for part in parts) else jnp.broadcast_arrays(*parts)
+    shape, across = (len(parts), *alike[0].shape), tuple(range(1, alike[0].ndim + 1))
+    index = lax.broadcasted_iota(np.int32, shape, 0)
+    whole = [lax.broadcast_in_dim(part, shape, across) for part in alike]
+    vector = whole[-1]
     for k in range(len(parts) - 2, -1, -1):
-        vector = jnp.where(index == k, alike[k][None], vector)
+        vector = lax.select(lax.eq(index, lax.full_like(index, k)), whole[k], vector)
     return vector
 
 

@@ -45,6 +45,11 @@ def turn_by(phi: Array, q: Array) -> Array:
     return compose(exp(phi), q)
 
 
+def turn_in_body(q: Array, phi: Array) -> Array:
+    """q turned further by the rotation vector phi in body axes: the same in the plane."""
+    return compose(q, exp(phi))
+
+
 def log(q: Array) -> Array:
     """Angle of q in (-pi, pi], (1, *batch) [rad]."""
     return jnp.arctan2(q[1:], q[:1])

@@ -4,9 +4,11 @@ Orientation q = unit quaternion (w, x, y, z), (4, *batch), body to world; in cod
 `w` stays the angular velocity. Vectors, angular velocities and momenta (3, *batch); inertia (3, 3, *batch).
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from diffrigid.numerics import components, cos_sin, dot, safe_sqrt
 
@@ -16,12 +18,8 @@ SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
 
 def cross(w: Array, r: Array) -> Array:
     """w x r: velocity of a point at r on a body that spins with w."""
-    return _cycle(w * _cycle(r) - _cycle(w) * r)
-
-
-def _cycle(r: Array) -> Array:
-    """(y, z, x)."""
-    return components(r[1], r[2], r[0])
+    (a, b, c), (x, y, z) = w, r
+    return components(b * z - c * y, c * x - a * z, a * y - b * x)
 
 
 moment = cross  # r x F: torque of a force F at r
@@ -29,47 +27,70 @@ moment = cross  # r x F: torque of a force F at r
 
 def rotate(q: Array, r: Array) -> Array:
     """Body axes to world axes: r + 2 s (u x r) + 2 u x (u x r)."""
-    s, u = q[:1], q[1:]
-    t = 2.0 * cross(u, r)
-    return r + s * t + cross(u, t)
+    return components(*_rotated(*q, r))
+
+
+def _rotated(s: Array, x: Array, y: Array, z: Array, r: Any) -> list[Array]:
+    """Components of r + 2 s (u x r) + 2 u x (u x r), u = (x, y, z)."""
+    a, b, c = r
+    p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return [a + s * p + y * r - z * q, b + s * q + z * p - x * r, c + s * r + x * q - y * p]
 
 
 def unrotate(q: Array, r: Array) -> Array:
     """World axes to body axes."""
-    s, u = q[:1], q[1:]
-    t = 2.0 * cross(u, r)
-    return r - s * t + cross(u, t)
+    s, x, y, z = q
+    return components(*_rotated(-s, x, y, z, r))
 
 
 def compose(q: Array, p: Array) -> Array:
     """First p, then q; brought back to unit length, so that rounding does not accumulate."""
-    product = _product(q, p)
-    # One Newton step for 1 / |q| about 1: exact to rounding for products of unit quaternions.
-    return product * (1.5 - 0.5 * dot(product, product))[None]
-
-
-def _product(q: Array, p: Array) -> Array:
-    """The quaternion product q p, (4, *batch)."""
-    i = components(-p[1], p[0], -p[3], p[2])
-    j = components(-p[2], p[3], p[0], -p[1])
-    k = components(-p[3], -p[2], p[1], p[0])
-    return q[:1] * p + q[1:2] * i + q[2:3] * j + q[3:] * k
+    return _unit_product(q, p)
 
 
 def exp(phi: Array) -> Array:
     """Quaternion of the rotation vector phi [rad], (3, *batch)."""
-    square = dot(phi, phi)
+    return components(*_exp(phi))
+
+
+def turn_by(phi: Array, q: Array) -> Array:
+    """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
+    return _unit_product(_exp(phi), q)
+
+
+def turn_in_body(q: Array, phi: Array) -> Array:
+    """q turned further by the rotation vector phi in body axes, (A, *batch) [rad]."""
+    return _unit_product(q, _exp(phi))
+
+
+def _exp(phi: Array) -> list[Array]:
+    """Components of the quaternion. As in all of this module: XLA would compute a vector again for each that is picked."""
+    x, y, z = phi
+    square = x * x + y * y + z * z
     small = square < 1e-8  # there the series below is exact to rounding, and sqrt has no derivative at 0
     half = 0.5 * safe_sqrt(jnp.where(small, 1.0, square))
     cosine, sine = cos_sin(half)
     s = jnp.where(small, 1.0 - square / 8.0, cosine)
     scale = jnp.where(small, 0.5 - square / 48.0, 0.5 * sine / half)
-    return components(s, *(scale[None] * phi))
+    return [s, scale * x, scale * y, scale * z]
 
 
-def turn_by(phi: Array, q: Array) -> Array:
-    """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
-    return compose(exp(phi), q)
+def _product(q: Any, p: Any) -> list[Array]:
+    """Components of the quaternion product q p."""
+    (s, a, b, c), (t, x, y, z) = q, p
+    return [
+        s * t - a * x - b * y - c * z,
+        s * x + a * t + b * z - c * y,
+        s * y - a * z + b * t + c * x,
+        s * z + a * y - b * x + c * t,
+    ]
+
+
+def _unit_product(q: Any, p: Any) -> Array:
+    product = _product(q, p)
+    # One Newton step for 1 / |q| about 1: exact to rounding for products of unit quaternions.
+    scale = 1.5 - 0.5 * sum(c * c for c in product)
+    return components(*(scale * c for c in product))
 
 
 def log(q: Array) -> Array:
@@ -84,8 +105,26 @@ def log(q: Array) -> Array:
 
 
 def matrix_product(m: Array, r: Array) -> Array:
-    """(3, 3, *batch) times (3, *batch), in components."""
-    return m[:, 0] * r[:1] + m[:, 1] * r[1:2] + m[:, 2] * r[2:]
+    """(3, 3, *batch) times (3, *batch)."""
+    return components(*_product_of_rows(_entries(m), r))
+
+
+def _entries(m: Array) -> list[list[Array]]:
+    return [list(row) for row in m]
+
+
+def _product_of_rows(m: Any, r: Any) -> list[Array]:
+    x, y, z = r
+    return [a * x + b * y + c * z for a, b, c in m]
+
+
+def _matrix(q: Array) -> list[list[Array]]:
+    """Entries of the rotation matrix of q."""
+    s, x, y, z = q
+    u, v, w = 2.0 * x, 2.0 * y, 2.0 * z
+    xx, yy, zz, xy, xz, yz = u * x, v * y, w * z, u * y, u * z, v * z
+    sx, sy, sz = s * u, s * v, s * w
+    return [[1.0 - yy - zz, xy - sz, xz + sy], [xy + sz, 1.0 - xx - zz, yz - sx], [xz - sy, yz + sx, 1.0 - xx - yy]]
 
 
 def inverse_inertia(inertia: Array) -> Array:
@@ -97,7 +136,9 @@ def inverse_inertia(inertia: Array) -> Array:
 
 def spin(inertia: Array, q: Array, w: Array) -> Array:
     """Angular momentum L = R I R^T w, world axes [kg m^2/s]."""
-    return rotate(q, matrix_product(inertia, unrotate(q, w)))
+    s, x, y, z = q
+    l = _product_of_rows(_entries(inertia), _rotated(-s, x, y, z, w))
+    return components(*_rotated(s, x, y, z, l))
 
 
 def unspin(inverse: Array, q: Array, L: Array) -> Array:
@@ -107,9 +148,9 @@ def unspin(inverse: Array, q: Array, L: Array) -> Array:
 
 def world_inverse(inverse: Array, q: Array) -> Array:
     """Inverse inertia in world axes, R I^-1 R^T, (3, 3, *batch); `apply` multiplies by it."""
-    rotate_rows = jax.vmap(rotate, in_axes=(None, 0))
-    half = rotate_rows(q, jnp.swapaxes(inverse, 0, 1))  # rows: R (I^-1)^T e_j
-    return rotate_rows(q, jnp.swapaxes(half, 0, 1))
+    R = _matrix(q)
+    half = [_product_of_rows(_entries(inverse), row) for row in R]  # rows of R I^-1, which is symmetric
+    return components(*(components(*_product_of_rows(half, row)) for row in R))
 
 
 apply = matrix_product  # I^-1 tau, both in world axes
@@ -135,29 +176,35 @@ def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
     Source: Iserles et al., Lie-group methods, Acta Numerica 2000, section 4; Hairer, Lubich, Wanner,
     Geometric Numerical Integration, VII.5.
     """
-    l = [unrotate(q, L)]
-    t = None if tau is None else [unrotate(q, tau)]
-    w = [matrix_product(inverse, l[0])]
-    for k in range(SERIES_ORDER - 1):
-        l_next = _convolve(l, w) if t is None else _convolve(l, w) + t[k]
-        if t is not None:
-            t.append(_convolve(t, w) / (k + 1))
-        l.append(l_next / (k + 1))
-        w.append(matrix_product(inverse, l[-1]))
-    turn, twist = [w[0]], []  # twist[n]: coefficient of s^(n+1) in turn x w
-    for n in range(1, SERIES_ORDER):
-        twist.append(_convolve(turn, w[:n]))
-        rate = w[n] + 0.5 * twist[-1]
-        if n > 1:
-            rate = rate + _convolve(turn[: n - 1], twist[: n - 1]) / 12.0
-        turn.append(rate / (n + 1))
-    return jnp.stack(turn)
+    l = unrotate(q, L)
+    w = matrix_product(inverse, l)
+    drives = [l, w] if tau is None else [l, w, unrotate(q, tau)]
+    first = jnp.stack(drives)[:, None]  # l, turn and, if there is one, t: each is driven by its product with w
+    empty = jnp.zeros((1, SERIES_ORDER - 1, *w.shape), w.dtype)
+    start = jnp.concatenate([first, empty + jnp.zeros_like(first)], axis=1)
+    rates, twists = jnp.concatenate([w[None], empty[0]]), jnp.zeros_like(start[0])
+
+    def put(coefficients, k, value):
+        return lax.dynamic_update_index_in_dim(coefficients, value, k, 0)
+
+    def following(n, carry):
+        series, rates, twists = carry
+        l_w, turn_w, *t_w = jax.vmap(_coefficient, (0, None, None))(series, rates, n - 1)
+        twist_turn = _coefficient(series[1], twists, n - 2)
+        l = (l_w if tau is None else l_w + lax.dynamic_index_in_dim(series[2], n - 1, 0, False)) / n
+        w = matrix_product(inverse, l)
+        turn = (w + 0.5 * turn_w + twist_turn / 12.0) / (n + 1)
+        new = jnp.stack([l, turn, *(t / n for t in t_w)])
+        return put(jnp.swapaxes(series, 0, 1), n, new).swapaxes(0, 1), put(rates, n, w), put(twists, n - 1, turn_w)
+
+    return lax.fori_loop(1, SERIES_ORDER, following, (start, rates, twists))[0][1]
 
 
-def _convolve(a: list[Array], b: list[Array]) -> Array:
-    """The highest coefficient of the cross product of two power series of equal length, sum_i a[i] x b[-1-i]."""
-    first, second = jnp.stack(a, axis=1), jnp.stack(b[::-1], axis=1)
-    return cross(first, second).sum(1)
+def _coefficient(a: Array, b: Array, n: Array) -> Array:
+    """Coefficient n of the cross product of power series, sum_i a[i] x b[n-i]; (K, 3, *batch) -> (3, *batch)."""
+    reversed_b = lax.concatenate([lax.rev(b, (0,)), jnp.zeros_like(b)], 0)
+    b = lax.dynamic_slice_in_dim(reversed_b, SERIES_ORDER - 1 - n, SERIES_ORDER, 0)
+    return jax.vmap(cross)(a, b).sum(0)
 
 
 def turn_rate(phi: Array, w: Array) -> Array:
@@ -171,12 +218,13 @@ def turn_rate(phi: Array, w: Array) -> Array:
 
 def rate(w: Array, q: Array) -> Array:
     """dq/dt of a body that turns with w in world axes, (4, *batch) [1/s]."""
-    return 0.5 * _product(components(jnp.zeros_like(w[0]), *w), q)
+    return 0.5 * components(*_product([jnp.zeros_like(w[0]), *w], q))
 
 
 def difference(q: Array, p: Array) -> Array:
     """p as seen from q: the rotation after which q brings to p."""
-    return compose(components(q[0], *-q[1:]), p)
+    s, x, y, z = q
+    return _unit_product([s, -x, -y, -z], p)
 
 
 def sine(q: Array) -> Array:

@@ -15,6 +15,7 @@ which is Newton's law at a slightly larger distance: it keeps momentum, makes no
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.collide import Contacts
 from diffrigid.contact.sides import (
@@ -26,7 +27,7 @@ from diffrigid.contact.sides import (
     reach_of,
     relative_acceleration,
 )
-from diffrigid.numerics import dot, implicit_root, norm, safe_divide, safe_sqrt, softplus
+from diffrigid.numerics import FOUND, dot, implicit_root, norm, safe_divide, safe_sqrt, softplus
 from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere
 from diffrigid.state import rotations
 
@@ -56,8 +57,10 @@ def find_impact(
     s0, level, found, _ = approach(a, b, t1, width, straight)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
+    s0, hit = checkpoint_name((s0, hit), FOUND)
     slack = jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.minimum(reach_of(a), reach_of(b))
-    at_a, at_b = place(a, s0), place(b, s0)
+    live = jnp.any(t1 > 0)
+    at_a, at_b = place(a, s0, live), place(b, s0, live)
     moved = contacts_of(a, at_a, b, at_b)
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
     closing = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
@@ -171,19 +174,20 @@ def _approach_search(a: Side, b: Side, t1: Array, width: Array | None) -> tuple[
     start, bound = _earliest(a, b)
     frozen_a, frozen_b = lax.stop_gradient((a, b))
     size = jnp.minimum(reach_of(a), reach_of(b))
-    near = _advance(frozen_a, frozen_b, start, t1, NEAR * size)
+    near = checkpoint_name(_advance(frozen_a, frozen_b, start, t1, NEAR * size), FOUND)
+    live = jnp.any(t1 > 0)
 
     def smooth(near):
-        return _closest_level(a, b, near, t1 - start, width)  # type: ignore[arg-type]
+        return _closest_level(a, b, near, t1 - start, width, live)  # type: ignore[arg-type]
 
     level = _if_smooth(width, smooth, jnp.zeros_like, near)
-    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size)
+    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, t1 - start, live)
     return jnp.where(s < bound, start, s), level, found
 
 
-def _motion(a: Side, b: Side, s: Array) -> tuple[Contacts, Array, Array]:
+def _motion(a: Side, b: Side, s: Array, live: Array) -> tuple[Contacts, Array, Array]:
     """Contacts at s, the rates of their gaps, (K, *batch) [m/s], and the accelerations of them [m/s^2]."""
-    at_a, at_b = place(a, s), place(b, s)
+    at_a, at_b = place(a, s, live), place(b, s, live)
     contacts = contacts_of(a, at_a, b, at_b)
 
     def pull(n, p):
@@ -206,58 +210,76 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
     """Advance until a contact is within `near` and closing, or the step is over.
 
     Each advance is the least, over the contacts, of the gap over a bound on the closing speed for the present
-    normal (Mirtich 1996), so that a body that only translates arrives in one; a contact that touches and
-    separates may be passed for as long as its parabola stays open.
+    normal (Mirtich 1996), so that a body that only translates arrives in one. The gap of a corner and a plane is
+    a smooth function of time: it stays above a parabola as bent as any point of the body can be, which takes a tenth
+    of the advances. A contact that touches and separates may be passed for as long as its parabola stays open.
     """
-    spinning = _unsteady(a, t1 - start) + _unsteady(b, t1 - start)
+    live, span = jnp.any(t1 > 0), jnp.maximum(t1 - start, 0.0)
+    (spin_a, bend_a), (spin_b, bend_b) = _unsteady(a, span), _unsteady(b, span)
+    spinning, bend = spin_a + spin_b, bend_a + bend_b
+    corners = isinstance(b.shape, HalfSpace)
 
     def safe_time(s):
-        contacts, v, acc = _motion(a, b, s)
-        approach = centre(a, s)[1] - centre(b, s)[1]
-        bound = jnp.maximum(-(contacts.normal * approach[None]).sum(1), 0.0) + spinning[None]
-        apart = jnp.where(bound > 0, safe_divide(contacts.gap, bound), jnp.inf)
+        contacts, v, acc = _motion(a, b, s, live)
+        if corners:
+            apart = safe_divide(2.0 * contacts.gap, safe_sqrt(v * v + 2.0 * bend[None] * contacts.gap) - v)
+        else:
+            approach = centre(a, s)[1] - centre(b, s)[1]
+            bound = jnp.maximum(-(contacts.normal * approach[None]).sum(1), 0.0) + spinning[None]
+            apart = jnp.where(bound > 0, safe_divide(contacts.gap, bound), jnp.inf)
         return jnp.where(contacts.gap > near[None], apart, jnp.where(v < 0, 0.0, _time_to(contacts.gap, v, acc))).min(0)
 
     def busy(carry):
         count, s, dt = carry
-        return (count < ADVANCES) & jnp.any((dt > 0) & (s < t1))
+        return (count == 0) | ((count < ADVANCES) & jnp.any((dt > 0) & (s < t1)))
 
     def advance(carry):
         count, s, dt = carry
         onward = jnp.where(s < t1, jnp.minimum(s + jnp.maximum(dt, 0.0), t1), s)
         return count + 1, onward, safe_time(onward)
 
-    return lax.while_loop(busy, advance, (0, start, safe_time(start)))[1]
+    return lax.while_loop(busy, advance, (0, start, jnp.zeros_like(start)))[1]
 
 
-def _unsteady(side: Side, span: Array) -> Array:
-    """Bound on what spin and acceleration add to the speed of any point within the step, (*batch) [m/s]."""
+def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
+    """Bounds within the step on what spin and acceleration add to the speed of a point, and on its acceleration.
+
+    (*batch) [m/s], [m/s^2]. Without a torque a rigid body has no greater angular acceleration than w^2.
+    """
     f = side.flight
     if f is None:
-        return jnp.zeros_like(span)
-    w = rotations(f.dim).unspin(f.inverse_inertia, f.q, f.L)
-    return 1.1 * norm(w) * reach_of(side) + norm(f.a) * jnp.maximum(span, 0.0)
+        return jnp.zeros_like(span), jnp.zeros_like(span)
+    so, reach = rotations(f.dim), reach_of(side)
+    w, a = norm(so.unspin(f.inverse_inertia, f.q, f.L)), norm(f.a)
+    if f.jerk is not None:
+        a = a + span * norm(f.jerk)
+    bend = a + 2.5 * w * w * reach
+    if f.tau is not None:
+        bend = bend + reach * norm(so.unspin(f.inverse_inertia, f.q, f.tau))
+    return 1.1 * w * reach + a * span, bend
 
 
-def _polish(a: Side, b: Side, s: Array, level: Array, size: Array) -> tuple[Array, Array]:
+def _polish(a: Side, b: Side, s: Array, level: Array, size: Array, span: Array, live: Array) -> tuple[Array, Array]:
     """Time near s at which the first contact comes to gap = level, and whether one does."""
 
-    def next_time(s):
-        contacts, v, acc = _motion(a, b, s)
-        return _time_to(contacts.gap - level[None], v, acc).min(0)
+    slack = jnp.sqrt(jnp.finfo(s.dtype).eps)
 
-    def towards(_, s):
-        dt = next_time(s)
-        return s + jnp.where(jnp.isfinite(dt), dt, 0.0)
+    def busy(carry):
+        count, _, dt, _ = carry
+        return (count <= POLISH) & jnp.any(jnp.abs(dt) > slack * span)
 
-    s = lax.fori_loop(0, POLISH, towards, s)
-    contacts, v, acc = _motion(a, b, s)
-    slack = jnp.sqrt(jnp.finfo(s.dtype).eps) * size
-    at_level = (contacts.gap <= (level + slack)[None]) & ((v < 0) | (acc < 0))
-    return s, at_level.any(0)
+    def towards(carry):
+        count, s, _, _ = carry
+        contacts, v, acc = _motion(a, b, s, live)
+        dt = _time_to(contacts.gap - level[None], v, acc).min(0)
+        dt = jnp.where(jnp.isfinite(dt), dt, 0.0)
+        at_level = (contacts.gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0))
+        return count + 1, s + dt, dt, at_level.any(0)
+
+    return lax.while_loop(busy, towards, (0, s, jnp.inf + s, s < s))[1::2]
 
 
-def _closest_level(a: Side, b: Side, s: Array, span: Array, width: Array) -> Array:
+def _closest_level(a: Side, b: Side, s: Array, span: Array, width: Array, live: Array) -> Array:
     """Smooth level from the closest approach of the two paths, of the contact with the least gap at s.
 
     The curvature of the gap is a difference of its rate over a quarter of the step: it holds what corners and
@@ -265,22 +287,22 @@ def _closest_level(a: Side, b: Side, s: Array, span: Array, width: Array) -> Arr
     """
     eta = 0.25 * span
 
+    def motion(a, b, s):
+        at_a, at_b = place(a, s, live), place(b, s, live)
+        contacts = contacts_of(a, at_a, b, at_b)
+        return contacts.gap, gap_rates(contacts, at_a, at_b)
+
     def least(a, b, s):
-        contacts = contacts_of(a, place(a, s), b, place(b, s))
-        chosen = jax.nn.one_hot(jnp.argmin(contacts.gap, 0), contacts.gap.shape[0], axis=0, dtype=s.dtype)
-
-        def rate(t):
-            at_a, at_b = place(a, t), place(b, t)
-            return (chosen * gap_rates(contacts_of(a, at_a, b, at_b), at_a, at_b)).sum(0)
-
-        curvature = safe_divide(rate(s + eta) - rate(s - eta), 2.0 * eta)
-        return (chosen * contacts.gap).sum(0), rate(s), curvature
+        gaps, rates = jax.vmap(lambda t: motion(a, b, t))(jnp.stack([s - eta, s, s + eta]))
+        chosen = jax.nn.one_hot(jnp.argmin(gaps[1], 0), gaps.shape[1], axis=0, dtype=s.dtype)
+        before, now, after = (chosen[None] * rates).sum(1)
+        return (chosen * gaps[1]).sum(0), now, safe_divide(after - before, 2.0 * eta)
 
     def towards(_, t):
         _, v, curvature = least(*lax.stop_gradient((a, b)), t)
         return jnp.clip(t - jnp.where(curvature > 0, safe_divide(v, curvature), 0.0), s - span, s + span)
 
-    closest = lax.stop_gradient(lax.fori_loop(0, POLISH, towards, s))
+    closest = checkpoint_name(lax.stop_gradient(lax.fori_loop(0, POLISH, towards, s)), FOUND)
     gap, v, curvature = least(a, b, closest)
     turns_back = curvature > 0
     gap_min = gap - 0.5 * safe_divide(v * v, jnp.where(turns_back, curvature, 0.0))

@@ -66,8 +66,10 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
     Differentiable except at the switches: separating to closing, stick to slip.
     """
     basis, axes = _contact_frame(n), range(n.shape[0])
-    k: list = [[sum(basis[i][p] * K[p, q] * basis[j][q] for p in axes for q in axes) for j in axes] for i in axes]
-    v_n, *v_t = [sum(basis[i][p] * v[p] for p in axes) for i in axes]
+    moved = [times(K, e) for e in basis]
+    upper = {(i, j): dot(basis[i], moved[j]) for j in axes for i in range(j + 1)}
+    k = [[upper[min(i, j), max(i, j)] for j in axes] for i in axes]
+    v_n, *v_t = [dot(e, v) for e in basis]
     gamma = jnp.maximum(safe_divide(target - v_n, k[0][0]), 0.0)
     after = [v_i + gamma * k_in for v_i, (k_in, *_) in zip([v_n, *v_t], k, strict=True)]
     Q = _friction_impulse(k, gamma, after[1:], mu)

@@ -15,6 +15,7 @@ gives P, so v += P / m and x += (T / 2) P / m, its centroid being in the middle.
 floor under Coulomb friction this is exact.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -30,7 +31,7 @@ from diffrigid.contact.slots import meet
 from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
 from diffrigid.flight import Flight, orientation, position, state_at
 from diffrigid.joints import islands, linkage
-from diffrigid.numerics import constant, dot, norm, rows, safe_divide
+from diffrigid.numerics import FOUND, constant, dot, norm, rows, safe_divide
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
@@ -77,7 +78,7 @@ class Contact:
         contacts = sum(len(pairs.a) * pairs.count for pairs in world.pairs)
         resting = jnp.zeros((contacts, *start.t0.shape[1:]), bool)
 
-        @jax.checkpoint  # what a pass computes is cheaper to compute again than to save, and to compile
+        @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
         def one_pass(anchors, resting, found, rests, phase):
             del found, rests
             return _pass(world, anchors, launch, resting, dt, phase)

@@ -5,11 +5,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.contact.impulse import impulses, times
 from diffrigid.contact.sides import at_colliders, side_sum
 from diffrigid.joints import Linkage, spread
-from diffrigid.numerics import safe_divide, safe_sqrt
+from diffrigid.numerics import FOUND, safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import rotations
 
@@ -147,7 +148,7 @@ def _fixed_point_jvp(primals, tangents):
     """dP = A dP + (law moved at fixed P), with A = (d law / dv) (what others do), solved by the same iteration."""
     shared, law, v_rel, arms, mobility = primals
     _, dlaw, dv_rel, darms, dmobility = tangents
-    P = _fixed_point(*primals)
+    P = checkpoint_name(_fixed_point(*primals), FOUND)
 
     def others(law, arms, mobility):
         return _others(law, P, arms, mobility)

@@ -9,8 +9,8 @@ from jax import Array, lax
 
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.distance import reach
-from diffrigid.flight import Flight, angular_velocity, orientation, position, velocity
-from diffrigid.numerics import dot, norm, rows
+from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
+from diffrigid.numerics import apart, dot, norm, rows
 from diffrigid.pytree import array, pytree
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
@@ -62,13 +62,15 @@ def side_of(world: Any, flight: Flight, since: Array, kind: int, shape_rows: tup
     return Side(flight=None, shape=shape, offset=offset, x=x, q=q)
 
 
-def place(side: Side, s: Array) -> Placed:
-    """The collider at time s (*batch) [s]."""
+def place(side: Side, s: Array, live: Array) -> Placed:
+    """The collider at time s (*batch) [s]; for `live` see `apart`."""
     f = side.flight
     if f is None:
         return Placed(x=side.x, q=side.q)
-    q = orientation(f, s)
-    w, inverse = angular_velocity(f, q, s), rotations(f.dim).world_inverse(f.inverse_inertia, q)
+    so = rotations(f.dim)
+    q = apart(live, orientation, f, s)
+    inverse = apart(live, so.world_inverse, f.inverse_inertia, q)
+    w = so.apply(inverse, angular_momentum(f, s))
     x, v = position(f, s), velocity(f, s)
     return Placed(x=x, q=q, v=v, w=w, a=f.a, inverse_mass=f.inverse_mass, inverse_inertia=inverse)
 

@@ -46,7 +46,8 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
     both_move = a.flight is not None and b.flight is not None
     straight, rest_speed = relative_path_is_straight(world, both_move), world.contact.rest_speed
     s, hit, level, slack = find_impact(a, b, dt, width, straight, rest_speed, at_end)
-    at_a, at_b = place(a, s), place(b, s)
+    live = jnp.any(dt > 0)
+    at_a, at_b = place(a, s, live), place(b, s, live)
     contacts = contacts_of(a, at_a, b, at_b)
     active = (contacts.gap <= (level + slack)[None]) & hit[None]
     pull, drift = _acceleration(at_a, at_b), jnp.zeros_like(at_a.x)
