@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.numerics import constant, dot, norm, rows, solve_symmetric
+from diffrigid.numerics import constant, dot, identity, norm, rows, solve_symmetric
 from diffrigid.pytree import Leaf, array, pytree, replace
 from diffrigid.so2 import perp
 from diffrigid.so3 import tangents
@@ -228,9 +228,7 @@ def linkage(joints: tuple, statics: Any, bodies: Bodies, state: State) -> Linkag
     """Of the joints of a world at these poses."""
     jac = jacobian(joints, statics, bodies, state)
     matrix = _mobility(jac)
-    count = matrix.shape[0]
-    units = jnp.eye(count, dtype=matrix.dtype).reshape(count, count, *[1] * (matrix.ndim - 2)) + jnp.zeros_like(matrix)
-    inverse = jax.vmap(lambda unit: solve_symmetric(matrix, unit))(units)
+    inverse = jax.vmap(lambda unit: solve_symmetric(matrix, unit))(identity(matrix))
     return Linkage(rows=jac.rows, mobile=jac.mobile, inverse=inverse)
 
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-
 FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
 
 
@@ -186,29 +185,43 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
     then one of many solutions, and finite. Gauss-Jordan without pivoting, one loop: the batch stays the last
     axis, and the derivative is another solution.
     """
-    count = matrix.shape[0]
-    tiny = 1e2 * jnp.finfo(matrix.dtype).eps * count
 
     def solve(matvec, right):
         del matvec
-        scale = lax.stop_gradient(jnp.abs(matrix).max((0, 1)))
-
-        def eliminate(k, system):
-            row = lax.dynamic_index_in_dim(system, k, 0, keepdims=False)
-            pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
-            inverse = jnp.where(pivot > tiny * scale, 1.0 / jnp.where(pivot > tiny * scale, pivot, 1.0), 0.0)
-            row = row * inverse[None]
-            column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
-            own = (jnp.arange(count) == k).astype(system.dtype).reshape(count, 1, *[1] * inverse.ndim)
-            return (1.0 - own) * (system - column[:, None] * row[None]) + own * row[None]
-
-        system = jnp.concatenate([lax.stop_gradient(matrix), right[:, None]], axis=1)
-        return lax.fori_loop(0, count, eliminate, system)[:, count]
+        return _gauss_jordan(matrix, right[:, None])[:, 0]
 
     def product(x):
         return (matrix * x[None]).sum(1)
 
     return lax.custom_linear_solve(product, right, solve, symmetric=True)
+
+
+def inverse_matrix(matrix: Array) -> Array:
+    """Inverse of matrices (R, R, *batch) that need no pivoting, without derivative."""
+    return _gauss_jordan(matrix, identity(matrix))
+
+
+def identity(like: Array) -> Array:
+    """Unit matrices, (R, R, *batch)."""
+    size, batch = like.shape[0], like.shape[2:]
+    return jnp.eye(size, dtype=like.dtype).reshape(size, size, *[1] * len(batch)) + jnp.zeros_like(like)
+
+
+def _gauss_jordan(matrix: Array, right: Array) -> Array:
+    """x of matrix x = right, (R, R, *batch), (R, M, *batch) -> (R, M, *batch); pivots of zero leave their row out."""
+    matrix, count = lax.stop_gradient(matrix), matrix.shape[0]
+    smallest = 1e2 * jnp.finfo(matrix.dtype).eps * count * jnp.abs(matrix).max((0, 1))
+
+    def eliminate(k, system):
+        row = lax.dynamic_index_in_dim(system, k, 0, keepdims=False)
+        pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
+        inverse = jnp.where(pivot > smallest, 1.0 / jnp.where(pivot > smallest, pivot, 1.0), 0.0)
+        row = row * inverse[None]
+        column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
+        own = (jnp.arange(count) == k).astype(system.dtype).reshape(count, 1, *[1] * inverse.ndim)
+        return (1.0 - own) * (system - column[:, None] * row[None]) + own * row[None]
+
+    return lax.fori_loop(0, count, eliminate, jnp.concatenate([matrix, right], axis=1))[:, count:]
 
 
 def softplus(x: Array, width: Array) -> Array:

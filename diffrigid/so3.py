@@ -27,7 +27,8 @@ moment = cross  # r x F: torque of a force F at r
 
 def rotate(q: Array, r: Array) -> Array:
     """Body axes to world axes: r + 2 s (u x r) + 2 u x (u x r)."""
-    return components(*_rotated(*q, r))
+    s, x, y, z = q
+    return components(*_rotated(s, x, y, z, r))
 
 
 def _rotated(s: Array, x: Array, y: Array, z: Array, r: Any) -> list[Array]:
@@ -64,7 +65,7 @@ def turn_in_body(q: Array, phi: Array) -> Array:
 
 
 def _exp(phi: Array) -> list[Array]:
-    """Components of the quaternion. As in all of this module: XLA would compute a vector again for each that is picked."""
+    """Components of the quaternion. XLA would compute a vector again for each component that is picked from it."""
     x, y, z = phi
     square = x * x + y * y + z * z
     small = square < 1e-8  # there the series below is exact to rounding, and sqrt has no derivative at 0
