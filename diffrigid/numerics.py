@@ -188,7 +188,8 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
 
     def solve(matvec, right):
         del matvec
-        return _gauss_jordan(matrix, right[:, None])[:, 0]
+        rounding = 1e2 * jnp.finfo(matrix.dtype).eps * matrix.shape[0] * jnp.abs(matrix).max((0, 1))
+        return _gauss_jordan(matrix, right[:, None], rounding)[:, 0]
 
     def product(x):
         return (matrix * x[None]).sum(1)
@@ -197,8 +198,8 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
 
 
 def inverse_matrix(matrix: Array) -> Array:
-    """Inverse of matrices (R, R, *batch) that need no pivoting, without derivative."""
-    return _gauss_jordan(matrix, identity(matrix))
+    """Inverse of regular matrices (R, R, *batch), without derivative."""
+    return _gauss_jordan(matrix, identity(matrix), jnp.zeros_like(matrix[0, 0]))
 
 
 def identity(like: Array) -> Array:
@@ -207,21 +208,31 @@ def identity(like: Array) -> Array:
     return jnp.eye(size, dtype=like.dtype).reshape(size, size, *[1] * len(batch)) + jnp.zeros_like(like)
 
 
-def _gauss_jordan(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, (R, R, *batch), (R, M, *batch) -> (R, M, *batch); pivots of zero leave their row out."""
+def _gauss_jordan(matrix: Array, right: Array, rounding: Array) -> Array:
+    """x of matrix x = right, (R, R, *batch), (R, M, *batch) -> (R, M, *batch).
+
+    Pivots are chosen by column in each matrix of the batch; rows stay where they are. A direction whose pivot is no
+    more than `rounding` (*batch) is left out.
+    """
     matrix, count = lax.stop_gradient(matrix), matrix.shape[0]
-    smallest = 1e2 * jnp.finfo(matrix.dtype).eps * count * jnp.abs(matrix).max((0, 1))
+    index = lax.broadcasted_iota(np.int32, (count, *matrix.shape[2:]), 0)
 
-    def eliminate(k, system):
-        row = lax.dynamic_index_in_dim(system, k, 0, keepdims=False)
-        pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
-        inverse = jnp.where(pivot > smallest, 1.0 / jnp.where(pivot > smallest, pivot, 1.0), 0.0)
-        row = row * inverse[None]
+    def eliminate(k, carry):
+        system, order = carry
         column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
-        own = (jnp.arange(count) == k).astype(system.dtype).reshape(count, 1, *[1] * inverse.ndim)
-        return (1.0 - own) * (system - column[:, None] * row[None]) + own * row[None]
+        best = jnp.argmax(jnp.where(order < count, -1.0, jnp.abs(column)), 0)
+        chosen = index == best.astype(np.int32)[None]
+        row = jnp.where(chosen[:, None], system, 0.0).sum(0)
+        pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
+        usable = jnp.abs(pivot) > rounding
+        row = row * jnp.where(usable, 1.0 / jnp.where(usable, pivot, 1.0), 0.0)[None]
+        system = jnp.where(chosen[:, None], row[None], system - column[:, None] * row[None])
+        return system, jnp.where(chosen, k, order)
 
-    return lax.fori_loop(0, count, eliminate, jnp.concatenate([matrix, right], axis=1))[:, count:]
+    start = jnp.concatenate([matrix, right], axis=1), jnp.full_like(index, count)
+    system, order = lax.fori_loop(0, count, eliminate, start)
+    x = system[:, count:]
+    return jnp.where((order[None] == index[:, None])[:, :, None], x[None], 0.0).sum(1)
 
 
 def softplus(x: Array, width: Array) -> Array:

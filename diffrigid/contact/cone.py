@@ -7,8 +7,8 @@ the nearest impulse in the sense of Coulomb,
 
 says at once that contacts do not pull, do not close, and slip only against all of their friction. It is solved by
 Newton's method with the derivative D of `project`. Sticking makes (1 - D) + D W / k singular where contacts repeat
-each other, as four corners on a floor do, so the method of multipliers is mixed in: D is taken (1 - e) D, with e the
-root of the rounding error. Then B = 1 - (1 - e) D has an inverse contact by contact, and with u = G J^T dP, the change
+each other, as four corners on a floor do, so the method of multipliers is mixed in: D is taken (1 - e) D, with a
+small e. Then B = 1 - (1 - e) D has an inverse contact by contact, and with u = G J^T dP, the change
 of the twists of the bodies,
 
     (1 + G J^T B^-1 D J / k) u = G J^T B^-1 r,    dP = B^-1 (r - D J u / k)
@@ -23,6 +23,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
@@ -33,7 +34,8 @@ from diffrigid.pytree import array, pytree, static
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most, of Newton's method
-SMALLEST_SHARE = 1e-3  # of a Newton step; if less does not help, the error is rounding
+FREE = 12  # rounds of whole steps, whether the error falls or not
+PATIENCE = 3  # rounds that do not lessen a small error: then it is rounding
 REFINEMENTS = 8  # of the linear system of the derivative
 
 
@@ -90,7 +92,7 @@ def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, 
     return dv + more[0], dw + more[1], dL + more[2]
 
 
-def relative_changes(arms: Arms, dv: Array, dw: Array) -> Array:
+def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
     """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
     so, both = rotations(dv.shape[1]), jnp.concatenate([dv, dw], axis=1)
     at_a, at_b = at_colliders(both, arms.a, 0.0), at_colliders(both, arms.b, 0.0)
@@ -169,7 +171,8 @@ def _unsloped(slope: Slope, e: float, r: Array) -> tuple[Array, Array]:
 
 
 def _small(dtype: Any) -> float:
-    return float(jnp.finfo(dtype).eps) ** 0.5
+    """e: an error of relative size (rounding / e^2 + e / least eigenvalue of W / k) is left by each step."""
+    return float(jnp.finfo(dtype).eps) ** 0.4
 
 
 def _bodies_inverse(slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
@@ -214,33 +217,34 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         shared: bool: there is such a contact in some world of the batch.
         v_rel: (C, D, *batch) [m/s] before the impulses.
 
-    Where a Newton step does not lessen the error of a world, that world goes a part of it.
+    After every Newton step P is brought back into the cones. Where that goes round in circles, in FREE rounds, the
+    steps are shortened until the error falls.
     """
     tolerance = 16.0 * jnp.finfo(v_rel.dtype).eps
 
     def busy(carry):
-        count, P, error, _, share = carry
-        unsettled = (error > tolerance * jnp.max(jnp.abs(P), (0, 1))) & (share > SMALLEST_SHARE)
-        return shared & (count < ROUNDS) & jnp.any(unsettled)
+        count, _, best, _, error, _, since = carry
+        size = jnp.max(jnp.abs(best), (0, 1))
+        return shared & (count < ROUNDS) & jnp.any(error > jnp.where(since < PATIENCE, tolerance, 1e-3) * size)
 
     def again(carry):
-        count, P, error, dP, share = carry
-        trial = P + share[None, None] * dP
-        z = _excess(cone, trial, v_rel, arms, mobility)
-        r = _project(cone, z) - trial
+        count, P, best, step, error, share, since = carry
+        z = _excess(cone, P, v_rel, arms, mobility)
+        r = _project(cone, z) - P
         size = jnp.max(jnp.abs(r), (0, 1))
-        better = size < error
         slope = _slope(cone, z)
-        onward = _newton_step(r, _bodies_inverse(slope, cone, arms, mobility), slope, cone, arms, mobility)
-        share = jnp.where(better, jnp.minimum(4.0 * share, 1.0), 0.25 * share)
-        P, dP = (jnp.where(better[None, None], new, old) for new, old in ((trial, P), (onward, dP)))
-        return count + 1, P, jnp.minimum(size, error), dP, share
+        dP = _newton_step(r, _bodies_inverse(slope, cone, arms, mobility), slope, cone, arms, mobility)
+        better, free = size < error, count < FREE
+        best, step = (jnp.where(better[None, None], new, old) for new, old in ((P, best), (dP, step)))
+        share = jnp.where(better, jnp.minimum(2.0 * share, 1.0), jnp.where(free, share, 0.25 * share))
+        onward = jnp.where(free, P + dP, best + share[None, None] * step)
+        since = jnp.where(better, 0, since + 1)
+        return count + 1, _project(cone, onward), best, step, jnp.minimum(size, error), share, since
 
-    nothing = jnp.zeros_like(v_rel)
     first = _project(cone, -(v_rel - cone.target[:, None] * cone.normal) / cone.scale[:, None])
-    error = jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
-    P = lax.while_loop(busy, again, (0, nothing, error, first, jnp.ones_like(error)))[1]
-    return jnp.where(cone.on[:, None] > 0, P, 0.0)
+    nothing, error = jnp.zeros_like(first), jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
+    start = (0, first, nothing, nothing, error, jnp.ones_like(error), jnp.zeros_like(error, np.int32))
+    return lax.while_loop(busy, again, start)[2]
 
 
 @solve_together.defjvp

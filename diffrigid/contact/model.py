@@ -24,14 +24,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
-from diffrigid.contact.cone import Mobility, momentum_changes, velocities
+from diffrigid.contact.cone import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.isolated import is_crowded, next_impacts, tables_of
 from diffrigid.contact.resting import Strikes, solve_impulses
 from diffrigid.contact.sides import at_colliders, body_sides, same_bodies, side_sum
 from diffrigid.contact.slots import meet
 from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
-from diffrigid.flight import Flight, orientation, position, state_at
-from diffrigid.joints import islands, linkage
+from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
+from diffrigid.joints import islands, linkage, spread
 from diffrigid.numerics import FOUND, constant, dot, norm, rows, safe_divide
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
@@ -203,6 +203,9 @@ def _apply(
     count, total = jnp.moveaxis(_over_islands(jnp.sum, own, islands(world.joints, moving), 0.0), 1, 0)
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
     q, mobility = _posed(world, flight, t)
+    onto = _onto_joints(flight, t, mobility, (count > 0) & (kick > 0))
+    if onto is not None:
+        strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
     P = solve_impulses(strikes, target, mu, mobility, own[:, 0])
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     early_P = _stopping_early(strikes, P, mu, held_for)
@@ -210,7 +213,23 @@ def _apply(
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
     kept = _keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
     kept = kept + _keeping_spin(strikes, _drift_after(strikes, dv), early_P, moving)
-    return _anchored(anchors, flight, t, q, count > 0, (kick * dv, kick * dL + kept), moved)
+    kicked = kick * dv, kick * dL + kept
+    if onto is not None:
+        kicked = kicked[0] + onto[0], kicked[1] + onto[2]
+    return _anchored(anchors, flight, t, q, count > 0, kicked, moved)
+
+
+def _onto_joints(flight: Flight, t: Array, mobility: Mobility, struck: Array) -> tuple[Array, Array, Array] | None:
+    """Changes of v, w and L that bring the velocities of `struck` bodies (N, *batch) onto their joints, if any.
+
+    A flight leaves the joints by the error of its integration. Contacts cannot mend that: two that stick on two bodies
+    of one linkage would press without bound.
+    """
+    if mobility.link is None:
+        return None
+    apply, on = rotations(flight.dim).apply, struck[:, None].astype(t.dtype)
+    v, L = jax.vmap(velocity)(flight, t), jax.vmap(angular_momentum)(flight, t)
+    return spread(mobility.link, on * v, on * jax.vmap(apply)(mobility.inverse_inertia, L))
 
 
 def _keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array:
