@@ -260,23 +260,25 @@ def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
 
 
 def _polish(a: Side, b: Side, s: Array, level: Array, size: Array, span: Array, live: Array) -> tuple[Array, Array]:
-    """Time near s at which the first contact comes to gap = level, and whether one does."""
+    """Time near s at which the first contact comes to gap = level, and whether one does; s if it is inside and sinks."""
 
-    slack = jnp.sqrt(jnp.finfo(s.dtype).eps)
+    slack, near = jnp.sqrt(jnp.finfo(s.dtype).eps), s
 
     def busy(carry):
-        count, _, dt, _ = carry
+        count, _, dt, *_ = carry
         return (count <= POLISH) & jnp.any(jnp.abs(dt) > slack * span)
 
     def towards(carry):
-        count, s, _, _ = carry
+        count, s, _, _, inside = carry
         contacts, v, acc = _motion(a, b, s, live)
         dt = _time_to(contacts.gap - level[None], v, acc).min(0)
         dt = jnp.where(jnp.isfinite(dt), dt, 0.0)
         at_level = (contacts.gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0))
-        return count + 1, s + dt, dt, at_level.any(0)
+        inside = jnp.where(count == 0, ((contacts.gap <= level[None]) & (v < 0)).any(0), inside)
+        return count + 1, s + dt, dt, at_level.any(0), inside
 
-    return lax.while_loop(busy, towards, (0, s, jnp.inf + s, s < s))[1::2]
+    _, s, _, found, inside = lax.while_loop(busy, towards, (0, s, jnp.inf + s, s < s, s < s))
+    return jnp.where(found, s, near), found | inside
 
 
 def _closest_level(a: Side, b: Side, s: Array, span: Array, width: Array, live: Array) -> Array:
