@@ -27,9 +27,9 @@ import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.contact.sides import at_colliders, side_sum
+from diffrigid.contact.sides import at_colliders, between_bodies, side_sum
 from diffrigid.joints import Linkage, spread
-from diffrigid.numerics import FOUND, dot, identity, inverse_matrix, norm, safe_divide
+from diffrigid.numerics import FOUND, dot, identity, inverse_matrix, norm, rows, safe_divide
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import rotations
 
@@ -176,16 +176,44 @@ def _small(dtype: Any) -> float:
 
 
 def _bodies_inverse(slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
-    """Inverse of 1 + G J^T B^-1 D J / k, (C, C, *batch) with C components of the twists of all bodies."""
-    moving, D, *batch = mobility.inverse_mass.shape[0], *arms.arm_a.shape[1:]
-    size = moving * (D + rotations(D).A)
+    """Inverse of 1 + G J^T B^-1 D J / k, (R, R, *batch) with R components of the twists of all bodies."""
+    moving, (D, *batch) = mobility.inverse_mass.shape[0], arms.arm_a.shape[1:]
+    so = rotations(D)
+    size = D + so.A
+    J_a, J_b = (jax.vmap(lambda arm: _by_units(so, arm))(arm) for arm in (arms.arm_a, arms.arm_b))  # (C, size, D)
 
-    def answer(twist):
-        back = _pushed_back(slope, cone, arms, twist)
-        return twist + _twists(back, arms, mobility)
+    def answers(J):  # of each contact to unit twists of one of its bodies: impulses
+        columns = jnp.swapaxes(J, 0, 1)
+        back = jax.vmap(lambda y: _unsloped(slope, _small(y.dtype), y)[1])(columns)
+        return jnp.swapaxes(back, 0, 1) / cone.scale[:, None, None]
 
-    like = jnp.zeros((size, size, *batch), arms.arm_a.dtype)
-    return inverse_matrix(jax.vmap(answer, out_axes=1)(identity(like)))
+    def block(J, back):  # J^T back, (C, size, size)
+        each = jax.vmap(jax.vmap(dot, (None, 0)), (0, None))
+        return jax.vmap(each)(J, back)
+
+    back_a, back_b = answers(J_a), answers(J_b)
+    own = side_sum(block(J_a, back_a), block(J_b, back_b), arms.a, arms.b, moving)
+    diagonal = jnp.eye(moving, dtype=own.dtype).reshape(moving, moving, *[1] * (own.ndim - 1))
+    whole = diagonal * own[:, None]
+    between = between_bodies(arms.a, arms.b, moving)
+    if between is not None:
+        across = -jnp.concatenate([block(J_a, back_b), block(J_b, back_a), jnp.zeros_like(own[:1])])
+        whole = whole + rows(across, between).sum(1).reshape(moving, moving, size, size, *batch)
+    columns = jnp.moveaxis(whole, (1, 3), (0, 1)).reshape(moving * size, moving, size, *batch)
+
+    def moved(column):
+        dv, dw, _ = velocities(mobility, column[:, :D], column[:, D:])
+        return jnp.concatenate([dv, dw], axis=1).reshape(-1, *batch)
+
+    matrix = jax.vmap(moved, out_axes=1)(columns)
+    return inverse_matrix(identity(matrix) + matrix)
+
+
+def _by_units(so: Any, arm: Array) -> Array:
+    """Velocity at an arm (D, *batch) for each unit twist of its body, (D + A, D, *batch)."""
+    size, batch = so.D + so.A, arm.shape[1:]
+    units = jnp.eye(size, dtype=arm.dtype).reshape(size, size, *[1] * len(batch))
+    return jax.vmap(lambda unit: unit[: so.D] + so.cross(unit[so.D :], arm))(units + jnp.zeros_like(arm[:1])[None])
 
 
 def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
@@ -225,7 +253,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
     def busy(carry):
         count, _, best, _, error, _, since = carry
         size = jnp.max(jnp.abs(best), (0, 1))
-        return shared & (count < ROUNDS) & jnp.any(error > jnp.where(since < PATIENCE, tolerance, 1e-3) * size)
+        return (count < ROUNDS) & jnp.any(error > jnp.where(since < PATIENCE, tolerance, 1e-3) * size)
 
     def again(carry):
         count, P, best, step, error, share, since = carry
@@ -241,10 +269,13 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         since = jnp.where(better, 0, since + 1)
         return count + 1, _project(cone, onward), best, step, jnp.minimum(size, error), share, since
 
-    first = _project(cone, -(v_rel - cone.target[:, None] * cone.normal) / cone.scale[:, None])
-    nothing, error = jnp.zeros_like(first), jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
-    start = (0, first, nothing, nothing, error, jnp.ones_like(error), jnp.zeros_like(error, np.int32))
-    return lax.while_loop(busy, again, start)[2]
+    def iterate(nothing):
+        first = _project(cone, -(v_rel - cone.target[:, None] * cone.normal) / cone.scale[:, None])
+        error = jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
+        start = (0, first, nothing, nothing, error, jnp.ones_like(error), jnp.zeros_like(error, np.int32))
+        return lax.while_loop(busy, again, start)[2]
+
+    return lax.cond(shared, iterate, lambda nothing: nothing, jnp.zeros_like(v_rel))
 
 
 @solve_together.defjvp

@@ -155,6 +155,22 @@ def body_sides(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> tuple[tup
 
 
 @functools.cache
+def between_bodies(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> tuple[tuple[int, ...], ...] | None:
+    """For every two moving bodies, the rows of [contacts of a with b, of b with a, nothing], (N * N, most).
+
+    None if contacts are with statics only.
+    """
+    between: dict[tuple[int, int], list[int]] = {}
+    for row, pair in enumerate(zip(a + b, b + a, strict=True)):
+        if max(pair) < moving:
+            between.setdefault(pair, []).append(row)
+    if not between:
+        return None
+    most, every = max(map(len, between.values())), [(i, j) for i in range(moving) for j in range(moving)]
+    return tuple(tuple((found := between.get(pair, [])) + [2 * len(a)] * (most - len(found))) for pair in every)
+
+
+@functools.cache
 def same_bodies(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
     """For each of C contacts, those between the same two colliders, itself included, padded by C; (C, most)."""
     members: dict[tuple[int, int], list[int]] = {}
