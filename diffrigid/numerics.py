@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+LARGE = 40  # rows of a matrix, from which on a library that does one after the other is faster than all at once
 FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
 
 
@@ -199,6 +200,10 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
 
 def inverse_matrix(matrix: Array) -> Array:
     """Inverse of regular matrices (R, R, *batch), without derivative."""
+    if len(matrix) > LARGE:
+        q, r = lax.linalg.qr(jnp.moveaxis(lax.stop_gradient(matrix), (0, 1), (-2, -1)))
+        inverse = lax.linalg.triangular_solve(r, jnp.swapaxes(q, -2, -1), left_side=True)
+        return jnp.moveaxis(inverse, (-2, -1), (0, 1))
     return _gauss_jordan(matrix, identity(matrix), jnp.zeros_like(matrix[0, 0]))
 
 

@@ -34,7 +34,7 @@ from diffrigid.pytree import array, pytree, static
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most, of Newton's method
-FREE = 12  # rounds of whole steps, whether the error falls or not
+SMOOTHING = 3  # rounds after each Newton step
 PATIENCE = 3  # rounds that do not lessen a small error: then it is rounding
 REFINEMENTS = 8  # of the linear system of the derivative
 
@@ -44,6 +44,8 @@ class Cone:
     """What C contacts demand of the velocity after their impulses."""
 
     on: Array = array("C")  # 1 where the contact takes part, else 0
+    rest_speed: Array = array()  # (*batch) [m/s] slow, for the world: its impulses are found to a small part of it
+    crowd: Array = array("C")  # contacts on the body that has more of them
     scale: Array = array("C")  # k [1/kg] of the order of the contact's mobility; the solution does not depend on it
     normal: Array = array("C", "D")
     target: Array = array("C")  # [m/s]
@@ -245,34 +247,39 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         shared: bool: there is such a contact in some world of the batch.
         v_rel: (C, D, *batch) [m/s] before the impulses.
 
-    After every Newton step P is brought back into the cones. Where that goes round in circles, in FREE rounds, the
-    steps are shortened until the error falls.
+    After every Newton step P is brought back into the cones, and made smoother by some rounds in which each contact
+    takes a share of the masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
     """
-    tolerance = 16.0 * jnp.finfo(v_rel.dtype).eps
+    rounding = jnp.finfo(v_rel.dtype).eps
+    tolerance, least = 16.0 * rounding, rounding**0.5 * cone.rest_speed
 
     def busy(carry):
-        count, _, best, _, error, _, since = carry
-        size = jnp.max(jnp.abs(best), (0, 1))
-        return (count < ROUNDS) & jnp.any(error > jnp.where(since < PATIENCE, tolerance, 1e-3) * size)
+        count, _, best, error, since = carry
+        small = jnp.where(since < PATIENCE, tolerance, jnp.where(since < 5 * PATIENCE, 1e-3, jnp.inf))
+        return (count < ROUNDS) & jnp.any(error > small * speed(best) + least)
+
+    def speed(P):
+        return jnp.max(cone.scale[:, None] * jnp.abs(P), (0, 1))
+
+    def smoother(_, P):
+        z = _excess(cone, P, v_rel, arms, mobility)
+        return _project(cone, P + (z - P) / cone.crowd[:, None])
 
     def again(carry):
-        count, P, best, step, error, share, since = carry
+        count, P, best, error, since = carry
         z = _excess(cone, P, v_rel, arms, mobility)
         r = _project(cone, z) - P
-        size = jnp.max(jnp.abs(r), (0, 1))
+        size = speed(r)
+        better = size < error
+        best, since = jnp.where(better[None, None], P, best), jnp.where(better, 0, since + 1)
         slope = _slope(cone, z)
         dP = _newton_step(r, _bodies_inverse(slope, cone, arms, mobility), slope, cone, arms, mobility)
-        better, free = size < error, count < FREE
-        best, step = (jnp.where(better[None, None], new, old) for new, old in ((P, best), (dP, step)))
-        share = jnp.where(better, jnp.minimum(2.0 * share, 1.0), jnp.where(free, share, 0.25 * share))
-        onward = jnp.where(free, P + dP, best + share[None, None] * step)
-        since = jnp.where(better, 0, since + 1)
-        return count + 1, _project(cone, onward), best, step, jnp.minimum(size, error), share, since
+        P = lax.fori_loop(0, SMOOTHING, smoother, _project(cone, P + dP))
+        return count + 1, P, best, jnp.minimum(size, error), since
 
     def iterate(nothing):
-        first = _project(cone, -(v_rel - cone.target[:, None] * cone.normal) / cone.scale[:, None])
         error = jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
-        start = (0, first, nothing, nothing, error, jnp.ones_like(error), jnp.zeros_like(error, np.int32))
+        start = (0, smoother(0, nothing), nothing, error, jnp.zeros_like(error, np.int32))
         return lax.while_loop(busy, again, start)[2]
 
     return lax.cond(shared, iterate, lambda nothing: nothing, jnp.zeros_like(v_rel))

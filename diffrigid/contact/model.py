@@ -206,7 +206,7 @@ def _apply(
     onto = _onto_joints(flight, t, mobility, (count > 0) & (kick > 0))
     if onto is not None:
         strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
-    P = solve_impulses(strikes, target, mu, mobility, own[:, 0])
+    P = solve_impulses(strikes, target, mu, mobility, own[:, 0], world.contact.rest_speed)
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     early_P = _stopping_early(strikes, P, mu, held_for)
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))

@@ -28,7 +28,9 @@ class Strikes:
     b: tuple[int, ...] = static(default=())
 
 
-def solve_impulses(strikes: Strikes, target: Array, mu: Array, mobility: Mobility, crowd: Array) -> Array:
+def solve_impulses(
+    strikes: Strikes, target: Array, mu: Array, mobility: Mobility, crowd: Array, rest_speed: Array
+) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
     A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `cone.py`.
@@ -37,13 +39,16 @@ def solve_impulses(strikes: Strikes, target: Array, mu: Array, mobility: Mobilit
         target: (C, *batch) [m/s] normal velocity after the impulse.
         mu: (C, *batch) [-].
         crowd: (N, *batch) number of active contacts of each body.
+        rest_speed: (*batch) [m/s] what is slow in these worlds.
     """
     most = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
-    shared = strikes.active & ((lax.stop_gradient(most) > 1) | (mobility.link is not None))
+    most = lax.stop_gradient(most)
+    shared = strikes.active & ((most > 1) | (mobility.link is not None))
     alone = impulses(strikes.active & ~shared, strikes.K, strikes.normal, strikes.v_rel, target, mu)
+    scale = lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
     cone = Cone(
-        on=shared.astype(most.dtype), scale=lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2)))),
-        normal=strikes.normal, target=target, mu=mu,
+        on=shared.astype(most.dtype), crowd=jnp.maximum(most, 1.0), scale=scale, normal=strikes.normal,
+        target=target, mu=mu, rest_speed=rest_speed,
     )  # fmt: skip
     arms = Arms(arm_a=strikes.arm_a, arm_b=strikes.arm_b, a=strikes.a, b=strikes.b)
     return alone + solve_together(jnp.any(shared), cone, strikes.v_rel, arms, mobility)
