@@ -19,13 +19,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scoring import search, show
 
 import diffrigid as dr
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "cube_toss" / "cube_toss_train.npz"
 PEERS = (11.7, 14.4)  # [%], [degrees]
-FRICTION, RESTITUTION = np.linspace(0.08, 0.32, 7), np.linspace(0.0, 0.36, 7)  # the coarse grid
-FINER, DRAWS = 4, 1000  # times as fine, about the best of the coarse grid
+RANGES = {"friction": (0.08, 0.32), "restitution": (0.0, 0.36)}
 
 
 def tosses(path: Path, rows: slice) -> dict:
@@ -50,7 +50,7 @@ def cube_world(record: dict) -> dr.World:
 
 
 def errors(record: dict):
-    """Function of friction (P,) and restitution (P,) -> errors in % and degrees, (P, tosses, 2)."""
+    """Function of arrays (P,) by the names of RANGES -> errors in % and degrees, (P, tosses, 2)."""
     world, steps = cube_world(record), record["x"].shape[1] - 1
     count = len(record["x"])
 
@@ -59,26 +59,13 @@ def errors(record: dict):
         states = dr.rollout_batch(world, start, dt=record["dt"], steps=steps)
         return states.x[:, :, 0], states.q[:, :, 0]
 
-    def of(friction, restitution):
-        def each_toss(leaf):  # parameters outside, tosses inside
-            return jnp.tile(leaf, (len(friction), *[1] * (leaf.ndim - 1)))
-
-        def each_point(values, leaf):
-            return jnp.repeat(jnp.asarray(values, jnp.float32), count)[:, None] * jnp.ones_like(leaf)
-
-        bodies = dr.replace(
-            world.bodies,
-            friction=each_point(friction, world.bodies.friction),
-            restitution=each_point(restitution, world.bodies.restitution),
-        )
-        statics = dr.replace(
-            world.statics,
-            friction=each_point(friction, world.statics.friction),
-            restitution=each_point(restitution, world.statics.restitution),
-        )
-        varied = dr.replace(world, bodies=bodies, statics=statics)
-        x, q = map(np.asarray, simulate(varied, jax.tree.map(each_toss, record["start"])))
-        x, q = (a.reshape(len(friction), count, *a.shape[1:]) for a in (x, q))
+    def of(values):
+        points = len(values["friction"])
+        material = {name: jnp.repeat(jnp.asarray(values[name], jnp.float32), count)[:, None] for name in RANGES}
+        bodies, statics = dr.replace(world.bodies, **material), dr.replace(world.statics, **material)
+        start = jax.tree.map(lambda leaf: jnp.tile(leaf, (points, *[1] * (leaf.ndim - 1))), record["start"])
+        x, q = map(np.asarray, simulate(dr.replace(world, bodies=bodies, statics=statics), start))
+        x, q = (a.reshape(points, count, *a.shape[1:]) for a in (x, q))
         distance = np.linalg.norm(x - record["x"], axis=-1) / (2 * record["half"]) * 100
         angle = 2 * np.degrees(np.arccos(np.clip(np.abs((q * record["q"]).sum(-1)), 0, 1)))
         return np.stack([np.nanmean(distance, axis=2), np.nanmean(angle, axis=2)], axis=-1)
@@ -91,10 +78,6 @@ def loss(error):
     return (error / np.array(PEERS)).sum(-1) / 2
 
 
-def grid(friction, restitution):
-    return [a.ravel() for a in np.meshgrid(friction, restitution, indexing="ij")]
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=DATA)
@@ -104,23 +87,12 @@ def main():
     began = time.perf_counter()
     record = tosses(args.data, slice(0, args.train))
     of = errors(record)
-    mu, e = grid(FRICTION, RESTITUTION)
-    best = loss(of(mu, e)).mean(1).argmin()
-    near = [
-        value + step * np.linspace(-1, 1, 2 * FINER + 1)
-        for value, step in ((mu[best], np.ptp(FRICTION) / 6), (e[best], np.ptp(RESTITUTION) / 6))
-    ]
-    mu, e = grid(np.unique(np.clip(near[0], 0, None)), np.unique(np.clip(near[1], 0, 1)))
-    by_toss = loss(of(mu, e))
-    best = by_toss.mean(1).argmin()
-    draws = np.random.default_rng(0).integers(args.train, size=(DRAWS, args.train))
-    again = np.array([by_toss[:, draw].mean(1).argmin() for draw in draws])
+    found = search(lambda values: loss(of(values)), RANGES)
     print(f"fit of {args.train} tosses: {time.perf_counter() - began:.0f} s, compilation included")
-    for name, values in (("friction", mu), ("restitution", e)):
-        low, high = np.quantile(values[again], [0.025, 0.975])
-        print(f"{name:12} {values[best]:.3f}   95 % of draws {low:.3f} to {high:.3f}")
+    show(found)
+    best = {name: np.array([value]) for name, (value, *_) in found.items()}
     test = tosses(args.data, slice(args.train, args.train + args.test))
-    scores = [of(mu[[best]], e[[best]])[0], errors(test)(mu[[best]], e[[best]])[0]]
+    scores = [of(best)[0], errors(test)(best)[0]]
     for name, error in zip(("training", "test"), scores, strict=True):
         mean, spread = error.mean(0), error.std(0) / np.sqrt(len(error))
         print(f"{name:12} {mean[0]:.1f} +- {spread[0]:.1f} % of the width, {mean[1]:.1f} +- {spread[1]:.1f} degrees")

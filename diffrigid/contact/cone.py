@@ -251,7 +251,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
     takes a share of the masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
     """
     rounding = jnp.finfo(v_rel.dtype).eps
-    tolerance, least = 16.0 * rounding, rounding**0.5 * cone.rest_speed
+    tolerance, least = 16.0 * rounding, rounding**0.6 * cone.rest_speed
 
     def busy(carry):
         count, _, best, error, since = carry

@@ -1,0 +1,69 @@
+"""Many contacts at rest and in motion: what stands, stands still, and what slides together stops together."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrigid as dr
+
+G, RATE = 9.81, 60
+STANDS = 1e-9  # [m] drift in two seconds; the solver works to rounding
+FLOOR = {"floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))}
+
+
+def drift_and_energy(bodies, friction, seconds=2.0):
+    world, state = dr.scene(bodies | FLOOR, gravity=(0.0, -G), friction=friction)
+    path = dr.rollout(world, state, dt=1 / RATE, steps=int(seconds * RATE)).state
+    end = jax.tree.map(lambda leaf: leaf[-1], path)
+    return float(jnp.abs(path.x - state.x[None]).max()), float(dr.kinetic_energy(world.bodies, end).sum())
+
+
+@pytest.mark.parametrize("load", [1.0, 100.0])
+def test_a_tower_stands_under_its_load(load):
+    box = dr.Box(half=(0.5, 0.5))
+    masses = [1.0] * 5 + [load]
+    drift, energy = drift_and_energy(
+        {f"{i}": dr.Body(box, mass=m, x=(0.0, 0.5 + i)) for i, m in enumerate(masses)}, 0.5
+    )
+    assert drift < STANDS
+    assert energy < STANDS**2
+
+
+def test_a_house_of_cards_stands():
+    """Two cards lean on each other; friction of their feet and of the ridge keeps them up."""
+    half, lean = (0.5, 0.02), np.radians(70.0)
+    height, reach = half[0] * np.sin(lean) + half[1] * np.cos(lean), half[0] * np.cos(lean) + half[1] * np.sin(lean)
+    cards = {
+        name: dr.Body(dr.Box(half=half), mass=0.1, x=(side * reach, height), angle=float(angle))
+        for name, side, angle in (("left", -1.0, lean), ("right", 1.0, np.pi - lean))
+    }
+    drift, energy = drift_and_energy(cards, 0.8)
+    assert drift < STANDS
+    assert energy < STANDS**2
+    assert drift_and_energy(cards, 0.05)[0] > 0.1  # and falls where its feet slip
+
+
+def test_two_blocks_slide_as_one():
+    """Closed form: a rider that sticks to a block slows down with it, by mu g, whatever the masses."""
+    time = 0.2
+
+    def at_end(p):
+        bodies = {
+            "block": dr.Body(dr.Box(half=(0.5, 0.2)), mass=p["m"], x=(0.0, 0.2), v=jnp.stack([p["v"], 0.0 * p["v"]])),
+            "rider": dr.Body(
+                dr.Box(half=(0.2, 0.1)), mass=0.7, x=(0.1, 0.5), v=jnp.stack([p["v"], 0.0 * p["v"]]), friction=0.9
+            ),
+        }
+        world, state = dr.scene(bodies | FLOOR, gravity=(0.0, -G), friction=p["mu"])
+        end = dr.rollout(world, state, dt=1 / RATE, steps=round(time * RATE)).state
+        return jnp.stack([end.x[-1, :, 0] - end.x[0, :, 0], end.v[-1, :, 0]])
+
+    p = {name: jnp.asarray(value) for name, value in {"m": 1.3, "v": 3.0, "mu": 0.4}.items()}
+    got, slopes, back = at_end(p), jax.jacfwd(at_end)(p), jax.jit(jax.jacrev(at_end))(p)
+    expected = [p["v"] * time - 0.5 * p["mu"] * G * time**2], [p["v"] - p["mu"] * G * time]
+    np.testing.assert_allclose(got, np.broadcast_to(expected, (2, 2)), rtol=1e-12)
+    right = {"m": [[0.0], [0.0]], "v": [[time], [1.0]], "mu": [[-0.5 * G * time**2], [-G * time]]}
+    for name, slope in right.items():
+        np.testing.assert_allclose(slopes[name], np.broadcast_to(slope, (2, 2)), atol=1e-9)
+        np.testing.assert_allclose(back[name], slopes[name], atol=1e-9)
