@@ -26,7 +26,7 @@ FRAME, HORIZONS = 1 / 250, (0.1, 0.2, 0.4)  # [s]
 PEERS = np.array([(11.7, 19.6), (24.2, 41.7), (40.0, 69.7)])  # [%], [degrees]
 SIDE, INERTIA, GRAVITY = 0.06, 6e-4, 9.81  # [m], [m^2] of unit mass, [m/s^2]
 DRAG, SPIN_DRAG = (0.557, 0.325), 0.455  # [1/s] from the plates
-RANGES = {"friction": (0.0, 0.36), "restitution": (0.3, 0.6), "floor": (0.0, 0.0024)}
+RANGES = {"friction": (0.0, 0.24), "restitution": (0.36, 0.6), "floor": (0.0, 0.0036)}
 
 
 def drops(path: Path, rows: slice) -> dict:
@@ -92,7 +92,7 @@ def main():
     args = parser.parse_args()
     began = time.perf_counter()
     of = errors(drops(args.data, slice(0, args.train)))
-    found = search(lambda values: (of(values) / PEERS).mean((-2, -1)), RANGES, points=5, finer=2)
+    found = search(lambda values: (of(values) / PEERS).mean((-2, -1)), RANGES)
     print(f"fit of {args.train} drops: {time.perf_counter() - began:.0f} s, compilation included")
     show(found)
     test = errors(drops(args.data, slice(args.train, args.train + args.test)))
