@@ -1,11 +1,11 @@
-"""Two numbers for 1300 impacts of an ellipse: how well does the contact law predict the velocities after each?
+"""Three numbers for 1300 impacts of an ellipse: how well does the contact law predict the velocities after each?
 
     python experiments/ellipse_impact.py [--data FILE]
 
 Measured states just before and after single impacts on a flat floor (MIT; see the README beside the data; the file is
-not part of this project). The law is applied at the measured contact point, `dr.contact.contact_law`; restitution and friction
-are found on every second impact and scored on the others by |v_observed - v_predicted| / |v_observed|, the mean over
-impacts of the norms of (vx, vz, omega) in SI units as they are, which is the metric of the source.
+not part of this project). The law is applied at the measured contact point, `dr.contact.contact_law`; restitution,
+friction and the inertia are found on every second impact and scored on the others by the mean over impacts of
+|v_observed - v_predicted| / |v_observed|, v = (vx, vz, omega) in SI units as they are, the metric of the source.
 
 Published: Newton's restitution 0.386, Poisson's 0.390, the best impulse in hindsight 0.009.
 """
