@@ -38,7 +38,13 @@ def stacked(letter: str) -> Any:
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(array, static, stacked))
 def pytree(cls):
-    """Make `cls` a frozen, keyword-only dataclass and register it with JAX."""
+    """Make `cls` a frozen, keyword-only dataclass and register it with JAX.
+
+    The name of the class is compiled in as a field of its own: JAX compares two records of different classes as equal
+    if only their fields are, and `jit` then now and then takes what it compiled for the other.
+    """
+    cls.__annotations__ = {**cls.__annotations__, "_class": str}
+    cls._class = dataclasses.field(default=cls.__qualname__, repr=False, kw_only=True, metadata={"static": True})
     cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
     fields = dataclasses.fields(cls)
     meta = [f.name for f in fields if f.metadata.get("static")]

@@ -48,9 +48,9 @@ def piles():
         "tower of 10": lambda: boxes(tower(10)),
         "tower of 5, load 100 : 1": lambda: boxes(tower(5), mass=heavy),
         "tower of 5 cubes": lambda: boxes([(0.0, *place) for place in tower(5)], (0.5, 0.5, 0.5)),
-        "pyramid of 10 rows": lambda: boxes(pyramid(10)),
         "wall of 5 x 5 bricks": lambda: boxes(wall(5, 5), (1.0, 0.5)),
         "house of cards": house,
+        "pyramid of 4 rows": lambda: boxes(pyramid(4)),
     }
 
 

@@ -90,6 +90,11 @@ def test_closed_forms(name):
     assert_same_body(mass_properties(shape, DENSITY, dim), expected)
 
 
+def test_records_of_two_classes_are_never_alike():
+    """Else `jit` may take what it compiled for the other."""
+    assert jax.tree.structure(Disc(radius=1.0)) != jax.tree.structure(Sphere(radius=1.0))
+
+
 def test_regular_polygons_tend_to_the_disc():
     for n in (12, 48):
         volume, _, gyration = shapes.volume_properties(Polygon(vertices=circle(n)), 2)
