@@ -29,7 +29,7 @@ def piles():
         return [(0.0, 0.5 + i) for i in range(count)]
 
     def pyramid(rows):
-        return [(i + 0.5 * row, 0.5 + row) for row in range(rows) for i in range(rows - row)]
+        return [(1.1 * (i + 0.5 * row), 0.5 + row) for row in range(rows) for i in range(rows - row)]
 
     def wall(rows, columns):
         return [(2.0 * i + 0.5 * (row % 2), 0.5 + row) for row in range(rows) for i in range(columns)]
@@ -50,7 +50,7 @@ def piles():
         "tower of 5 cubes": lambda: boxes([(0.0, *place) for place in tower(5)], (0.5, 0.5, 0.5)),
         "wall of 5 x 5 bricks": lambda: boxes(wall(5, 5), (1.0, 0.5)),
         "house of cards": house,
-        "pyramid of 4 rows": lambda: boxes(pyramid(4)),
+        "pyramid of 5 rows": lambda: boxes(pyramid(5)),
     }
 
 
