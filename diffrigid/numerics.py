@@ -183,8 +183,8 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
     """x of matrix x = right, for symmetric positive semidefinite matrices (R, R, *batch), (R, *batch) -> (R, *batch).
 
     A direction in which the matrix is zero to rounding, as of a constraint that repeats others, is left out: x is
-    then one of many solutions, and finite. Gauss-Jordan without pivoting, one loop: the batch stays the last
-    axis, and the derivative is another solution.
+    then one of many solutions, and finite. Gauss-Jordan in one loop, so that the batch stays the last axis; the
+    derivative is another solution.
     """
 
     def solve(matvec, right):

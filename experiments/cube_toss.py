@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scoring import search, show
+from scoring import open_loop, search, show
 
 import diffrigid as dr
 
@@ -51,21 +51,10 @@ def cube_world(record: dict) -> dr.World:
 
 def errors(record: dict):
     """Function of arrays (P,) by the names of RANGES -> errors in % and degrees, (P, tosses, 2)."""
-    world, steps = cube_world(record), record["x"].shape[1] - 1
-    count = len(record["x"])
-
-    @jax.jit
-    def simulate(world, start):
-        states = dr.rollout_batch(world, start, dt=record["dt"], steps=steps)
-        return states.x[:, :, 0], states.q[:, :, 0]
+    simulate = open_loop(cube_world(record), record["start"], record["dt"], record["x"].shape[1] - 1)
 
     def of(values):
-        points = len(values["friction"])
-        material = {name: jnp.repeat(jnp.asarray(values[name], jnp.float32), count)[:, None] for name in RANGES}
-        bodies, statics = dr.replace(world.bodies, **material), dr.replace(world.statics, **material)
-        start = jax.tree.map(lambda leaf: jnp.tile(leaf, (points, *[1] * (leaf.ndim - 1))), record["start"])
-        x, q = map(np.asarray, simulate(dr.replace(world, bodies=bodies, statics=statics), start))
-        x, q = (a.reshape(points, count, *a.shape[1:]) for a in (x, q))
+        x, q = simulate(values)
         distance = np.linalg.norm(x - record["x"], axis=-1) / (2 * record["half"]) * 100
         angle = 2 * np.degrees(np.arccos(np.clip(np.abs((q * record["q"]).sum(-1)), 0, 1)))
         return np.stack([np.nanmean(distance, axis=2), np.nanmean(angle, axis=2)], axis=-1)

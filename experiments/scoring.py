@@ -1,8 +1,40 @@
-"""What the experiments with measured tosses share: a search on a grid, coarse then fine, and intervals from draws."""
+"""What the experiments with measured tosses share: simulation of all records, a search on a grid, and intervals."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+import diffrigid as dr
+
 POINTS, FINER, DRAWS = 7, 4, 1000  # of the coarse grid each way; times as fine about its best; resampled records
+
+
+def open_loop(world, start, dt, steps):
+    """Function of arrays (P,) by name -> x and q of the one body, (P, records, T+1, ...).
+
+    Args:
+        start: states of the records, a leading axis.
+    The names are "friction", "restitution" and, if it is to be moved, "floor": its height [m] along the last axis.
+    """
+    count = len(start.x)
+
+    @jax.jit
+    def simulate(world, start):
+        states = dr.rollout_batch(world, start, dt=dt, steps=steps)
+        return states.x[:, :, 0], states.q[:, :, 0]
+
+    def of(values):
+        points = len(values["friction"])
+        each = {name: jnp.repeat(jnp.asarray(value, jnp.float32), count)[:, None] for name, value in values.items()}
+        height = each.pop("floor", None)
+        bodies, statics = dr.replace(world.bodies, **each), dr.replace(world.statics, **each)
+        if height is not None:
+            statics = dr.replace(statics, x=height[..., None] * jnp.eye(world.dim, dtype=jnp.float32)[-1])
+        starts = jax.tree.map(lambda leaf: jnp.tile(leaf, (points, *[1] * (leaf.ndim - 1))), start)
+        paths = simulate(dr.replace(world, bodies=bodies, statics=statics), starts)
+        return tuple(np.asarray(path).reshape(points, count, *path.shape[1:]) for path in paths)
+
+    return of
 
 
 def search(loss, ranges, points=POINTS, finer=FINER):

@@ -14,10 +14,9 @@ import argparse
 import time
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from scoring import search, show
+from scoring import open_loop, search, show
 
 import diffrigid as dr
 
@@ -57,25 +56,10 @@ def square_world() -> dr.World:
 
 def errors(record: dict):
     """Function of arrays (P,) by the names of RANGES -> errors in % and degrees, (P, drops, horizons, 2)."""
-    world, count, steps = square_world(), len(record["x"]), int(HORIZONS[-1] / FRAME)
-
-    @jax.jit
-    def simulate(world, start):
-        states = dr.rollout_batch(world, start, dt=FRAME, steps=steps)
-        return states.x[:, :, 0], states.q[:, :, 0]
+    simulate = open_loop(square_world(), record["start"], FRAME, int(HORIZONS[-1] / FRAME))
 
     def of(values):
-        points = len(values["friction"])
-
-        def each_point(name):
-            return jnp.repeat(jnp.asarray(values[name], jnp.float32), count)[:, None]
-
-        material = {name: each_point(name) for name in ("friction", "restitution")}
-        height = each_point("floor")[..., None] * jnp.array([0.0, 1.0], jnp.float32)
-        bodies, statics = dr.replace(world.bodies, **material), dr.replace(world.statics, **material, x=height)
-        start = jax.tree.map(lambda leaf: jnp.tile(leaf, (points, *[1] * (leaf.ndim - 1))), record["start"])
-        x, q = map(np.asarray, simulate(dr.replace(world, bodies=bodies, statics=statics), start))
-        x, q = (a.reshape(points, count, *a.shape[1:]) for a in (x, q))
+        x, q = simulate(values)
         distance = np.linalg.norm(x - record["x"], axis=-1) / SIDE * 100
         off = np.unwrap(np.arctan2(q[..., 1], q[..., 0]), axis=-1) - record["angle"]
         both = np.stack([distance, np.abs(np.degrees(off - 2 * np.pi * np.round(off[..., :1] / (2 * np.pi))))], -1)

@@ -8,8 +8,8 @@ the nearest impulse in the sense of Coulomb,
 says at once that contacts do not pull, do not close, and slip only against all of their friction. It is solved by
 Newton's method with the derivative D of `project`. Sticking makes (1 - D) + D W / k singular where contacts repeat
 each other, as four corners on a floor do, so the method of multipliers is mixed in: D is taken (1 - e) D, with a
-small e. Then B = 1 - (1 - e) D has an inverse contact by contact, and with u = G J^T dP, the change
-of the twists of the bodies,
+small e. Then B = 1 - (1 - e) D has an inverse contact by contact, and with u = G J^T dP, the change of the twists of
+the bodies,
 
     (1 + G J^T B^-1 D J / k) u = G J^T B^-1 r,    dP = B^-1 (r - D J u / k)
 

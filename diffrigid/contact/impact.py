@@ -261,7 +261,6 @@ def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
 
 def _polish(a: Side, b: Side, s: Array, level: Array, size: Array, span: Array, live: Array) -> tuple[Array, Array]:
     """Time near s at which the first contact comes to gap = level, and whether one does; s if inside and closing."""
-
     slack, near = jnp.sqrt(jnp.finfo(s.dtype).eps), s
 
     def busy(carry):

@@ -79,6 +79,7 @@ class Contact:
         contacts = sum(len(pairs.a) * pairs.count for pairs in world.pairs)
         resting = jnp.zeros((contacts, *start.t0.shape[1:]), bool)
 
+        # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches.
         @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
         def one_pass(anchors, resting, found, rests, phase):
             del found, rests
@@ -219,15 +220,15 @@ def _apply(
     return _anchored(anchors, flight, t, q, count > 0, kicked, moved)
 
 
-def _onto_joints(flight: Flight, t: Array, mobility: Mobility, struck: Array) -> tuple[Array, Array, Array] | None:
-    """Changes of v, w and L that bring the velocities of `struck` bodies (N, *batch) onto their joints, if any.
+def _onto_joints(flight: Flight, t: Array, mobility: Mobility, hit: Array) -> tuple[Array, Array, Array] | None:
+    """Changes of v, w and L that bring the velocities of bodies that are `hit` (N, *batch) onto their joints.
 
     A flight leaves the joints by the error of its integration. Contacts cannot mend that: two that stick on two bodies
     of one linkage would press without bound.
     """
     if mobility.link is None:
         return None
-    apply, on = rotations(flight.dim).apply, struck[:, None].astype(t.dtype)
+    apply, on = rotations(flight.dim).apply, hit[:, None].astype(t.dtype)
     v, L = jax.vmap(velocity)(flight, t), jax.vmap(angular_momentum)(flight, t)
     return spread(mobility.link, on * v, on * jax.vmap(apply)(mobility.inverse_inertia, L))
 
