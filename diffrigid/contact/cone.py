@@ -19,6 +19,7 @@ Bertsekas, Constrained Optimization and Lagrange Multiplier Methods, 1982, for e
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -27,13 +28,22 @@ import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.contact.sides import at_colliders, between_bodies, side_sum
-from diffrigid.joints import Linkage, spread
-from diffrigid.numerics import FOUND, dot, identity, inverse_matrix, norm, rows, safe_divide
-from diffrigid.pytree import array, pytree, static
+from diffrigid.contact.mobility import (
+    Arms,
+    Mobility,
+    bodies_inverse,
+    momentum_changes,
+    relative_changes,
+    twists,
+    velocities,
+)
+from diffrigid.contact.multipliers import solve_roughly
+from diffrigid.numerics import FOUND, dot, norm, safe_divide
+from diffrigid.pytree import array, pytree
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most, of Newton's method
+CIRCLES = 10  # rounds after which `solve_roughly` gives it another start
 SMOOTHING = 3  # rounds after each Newton step
 PATIENCE = 3  # rounds that do not lessen a small error: then it is rounding
 REFINEMENTS = 8  # of the linear system of the derivative
@@ -50,59 +60,6 @@ class Cone:
     normal: Array = array("C", "D")
     target: Array = array("C")  # [m/s]
     mu: Array = array("C")
-
-
-@pytree
-class Arms:
-    """Where C contacts act on their bodies; fields as in `Strikes`."""
-
-    arm_a: Array = array("C", "D")
-    arm_b: Array = array("C", "D")
-    a: tuple[int, ...] = static()
-    b: tuple[int, ...] = static()
-
-
-@pytree
-class Mobility:
-    """What turns impulses on the N moving bodies into changes of velocity."""
-
-    inverse_mass: Array = array("N")  # [1/kg]
-    inverse_inertia: Any = None  # [1/(kg m^2)] world axes
-    link: Linkage | None = None  # of the joints between them
-
-
-def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
-    """Changes of m v (N, D) [N s] and L (N, A) [N m s] of the moving bodies by the impulses P on side a.
-
-    Args:
-        arms: with the fields of `Arms`.
-    """
-    so = rotations(P.shape[1])
-    on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a, P)], axis=1)
-    on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b, -P)], axis=1)
-    total = side_sum(on_a, on_b, arms.a, arms.b, moving)
-    return total[:, : so.D], total[:, so.D :]
-
-
-def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, Array]:
-    """Changes of v [m/s], w [rad/s] and L by impulses dp and dL on the bodies, and by what the joints make of them."""
-    apply = rotations(dp.shape[1]).apply
-    dv, dw = mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL)
-    if mobility.link is None:
-        return dv, dw, dL
-    more = spread(mobility.link, dv, dw)
-    return dv + more[0], dw + more[1], dL + more[2]
-
-
-def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
-    """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
-    so, both = rotations(dv.shape[1]), jnp.concatenate([dv, dw], axis=1)
-    at_a, at_b = at_colliders(both, arms.a, 0.0), at_colliders(both, arms.b, 0.0)
-
-    def point_velocity(at, arm):
-        return at[: so.D] + so.cross(at[so.D :], arm)
-
-    return jax.vmap(point_velocity)(at_a, arms.arm_a) - jax.vmap(point_velocity)(at_b, arms.arm_b)
 
 
 @pytree
@@ -177,65 +134,22 @@ def _small(dtype: Any) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 
-def _bodies_inverse(slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
-    """Inverse of 1 + G J^T B^-1 D J / k, (R, R, *batch) with R components of the twists of all bodies."""
-    moving, (D, *batch) = mobility.inverse_mass.shape[0], arms.arm_a.shape[1:]
-    so = rotations(D)
-    size = D + so.A
-    J_a, J_b = (jax.vmap(lambda arm: _by_units(so, arm))(arm) for arm in (arms.arm_a, arms.arm_b))  # (C, size, D)
-
-    def answers(J):  # of each contact to unit twists of one of its bodies: impulses
-        columns = jnp.swapaxes(J, 0, 1)
-        back = jax.vmap(lambda y: _unsloped(slope, _small(y.dtype), y)[1])(columns)
-        return jnp.swapaxes(back, 0, 1) / cone.scale[:, None, None]
-
-    def block(J, back):  # J^T back, (C, size, size)
-        each = jax.vmap(jax.vmap(dot, (None, 0)), (0, None))
-        return jax.vmap(each)(J, back)
-
-    back_a, back_b = answers(J_a), answers(J_b)
-    own = side_sum(block(J_a, back_a), block(J_b, back_b), arms.a, arms.b, moving)
-    diagonal = jnp.eye(moving, dtype=own.dtype).reshape(moving, moving, *[1] * (own.ndim - 1))
-    whole = diagonal * own[:, None]
-    between = between_bodies(arms.a, arms.b, moving)
-    if between is not None:
-        across = -jnp.concatenate([block(J_a, back_b), block(J_b, back_a), jnp.zeros_like(own[:1])])
-        whole = whole + rows(across, between).sum(1).reshape(moving, moving, size, size, *batch)
-    columns = jnp.moveaxis(whole, (1, 3), (0, 1)).reshape(moving * size, moving, size, *batch)
-
-    def moved(column):
-        dv, dw, _ = velocities(mobility, column[:, :D], column[:, D:])
-        return jnp.concatenate([dv, dw], axis=1).reshape(-1, *batch)
-
-    matrix = jax.vmap(moved, out_axes=1)(columns)
-    return inverse_matrix(identity(matrix) + matrix)
-
-
-def _by_units(so: Any, arm: Array) -> Array:
-    """Velocity at an arm (D, *batch) for each unit twist of its body, (D + A, D, *batch)."""
-    size, batch = so.D + so.A, arm.shape[1:]
-    units = jnp.eye(size, dtype=arm.dtype).reshape(size, size, *[1] * len(batch))
-    return jax.vmap(lambda unit: unit[: so.D] + so.cross(unit[so.D :], arm))(units + jnp.zeros_like(arm[:1])[None])
+def _answer(slope: Slope, cone: Cone) -> Callable[[Array], Array]:
+    """B^-1 D / k: impulses for relative velocities, (C, D, *batch)."""
+    return lambda y: _unsloped(slope, _small(y.dtype), y)[1] / cone.scale[:, None]
 
 
 def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
     """B^-1 D J / k of the twists (C, *batch) of all bodies: impulses, (C, D, *batch)."""
     D = arms.arm_a.shape[1]
     by_body = twist.reshape(-1, D + rotations(D).A, *twist.shape[1:])
-    y = relative_changes(arms, by_body[:, :D], by_body[:, D:])
-    return _unsloped(slope, _small(y.dtype), y)[1] / cone.scale[:, None]
-
-
-def _twists(P: Array, arms: Arms, mobility: Mobility) -> Array:
-    """G J^T P: the change of the twists of all bodies by impulses, (C, *batch)."""
-    dv, dw, _ = velocities(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
-    return jnp.concatenate([dv, dw], axis=1).reshape(-1, *P.shape[2:])
+    return _answer(slope, cone)(relative_changes(arms, by_body[:, :D], by_body[:, D:]))
 
 
 def _newton_step(r: Array, inverse: Array, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
     """dP of (B + D W / k) dP = r, (C, D, *batch)."""
     direct = _unsloped(slope, _small(r.dtype), r)[0]
-    twist = (inverse * _twists(direct, arms, mobility)[None]).sum(1)
+    twist = (inverse * twists(direct, arms, mobility)[None]).sum(1)
     return direct - _pushed_back(slope, cone, arms, twist)
 
 
@@ -265,15 +179,22 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         z = _excess(cone, P, v_rel, arms, mobility)
         return _project(cone, P + (z - P) / cone.crowd[:, None])
 
+    def wrong(P):
+        return speed(_project(cone, _excess(cone, P, v_rel, arms, mobility)) - P)
+
+    def roughly(P, since):
+        return solve_roughly(cone, v_rel, arms, mobility, wrong, least), jnp.zeros_like(since)
+
     def again(carry):
         count, P, best, error, since = carry
+        P, since = lax.cond(count == CIRCLES, roughly, lambda P, since: (P, since), P, since)
         z = _excess(cone, P, v_rel, arms, mobility)
         r = _project(cone, z) - P
         size = speed(r)
         better = size < error
         best, since = jnp.where(better[None, None], P, best), jnp.where(better, 0, since + 1)
         slope = _slope(cone, z)
-        dP = _newton_step(r, _bodies_inverse(slope, cone, arms, mobility), slope, cone, arms, mobility)
+        dP = _newton_step(r, bodies_inverse(_answer(slope, cone), arms, mobility), slope, cone, arms, mobility)
         P = lax.fori_loop(0, SMOOTHING, smoother, _project(cone, P + dP))
         return count + 1, P, best, jnp.minimum(size, error), since
 
@@ -302,7 +223,7 @@ def _solve_together_jvp(primals, tangents):
         return x - _sloped(slope, x - _moved(x, arms, mobility) / cone.scale[:, None])
 
     def refined(matvec, b, transposed):
-        inverse = _bodies_inverse(*fixed)
+        inverse = bodies_inverse(_answer(*fixed[:2]), *fixed[2:])
 
         def step(r):
             return _newton_step(r, inverse, *fixed)

@@ -24,8 +24,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
-from diffrigid.contact.cone import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.isolated import is_crowded, next_impacts, tables_of
+from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.resting import Strikes, solve_impulses
 from diffrigid.contact.sides import at_colliders, body_sides, same_bodies, side_sum
 from diffrigid.contact.slots import meet

@@ -3,8 +3,9 @@
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.contact.cone import Arms, Cone, Mobility, solve_together
+from diffrigid.contact.cone import Cone, solve_together
 from diffrigid.contact.impulse import impulses
+from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sides import at_colliders
 from diffrigid.numerics import safe_sqrt
 from diffrigid.pytree import array, pytree, static
