@@ -44,6 +44,7 @@ from diffrigid.state import rotations
 
 ROUNDS = 40  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start
+PILE = 3  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
 SMOOTHING = 3  # rounds after each Newton step
 PATIENCE = 3  # rounds that do not lessen a small error: then it is rounding
 REFINEMENTS = 8  # of the linear system of the derivative
@@ -187,7 +188,8 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
 
     def again(carry):
         count, P, best, error, since = carry
-        P, since = lax.cond(count == CIRCLES, roughly, lambda P, since: (P, since), P, since)
+        if mobility.inverse_mass.shape[0] >= PILE:
+            P, since = lax.cond(count == CIRCLES, roughly, lambda P, since: (P, since), P, since)
         z = _excess(cone, P, v_rel, arms, mobility)
         r = _project(cone, z) - P
         size = speed(r)
