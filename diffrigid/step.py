@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.flight import Flight, launch
-from diffrigid.joints import onto_joints
+from diffrigid.linkage import onto_joints
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.state import State
 from diffrigid.world import World, check

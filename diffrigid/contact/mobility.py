@@ -1,4 +1,4 @@
-"""From impulses at contacts to changes of the bodies' velocities and back: J, G and J G J^T of `cone`."""
+"""From impulses at contacts to changes of the bodies' velocities and back: J, G and J G J^T of `together`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,18 +8,23 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.contact.sides import at_colliders, between_bodies, side_sum
-from diffrigid.joints import Linkage, spread
-from diffrigid.numerics import dot, identity, inverse_matrix, rows
+from diffrigid.linkage import Linkage, spread
+from diffrigid.numerics import dot, identity, inverse_matrix, rows, unit_vector
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import rotations
 
 
 @pytree
 class Arms:
-    """Where C contacts act on their bodies; fields as in `Strikes`."""
+    """Where C contacts act on their bodies; fields as in `Strikes`, which will do as well.
+
+    The last R of them, those that `jac` is of, are rows along coordinates of joints: the first component of their
+    velocities is the rate of a coordinate, that of their impulses acts along it, and they have no others.
+    """
 
     arm_a: Array = array("C", "D")
     arm_b: Array = array("C", "D")
+    jac: Any = array("R", "2", "D + A", default=None)  # of each coordinate by the twists of a and b
     a: tuple[int, ...] = static()
     b: tuple[int, ...] = static()
 
@@ -40,8 +45,12 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
         arms: with the fields of `Arms`.
     """
     so = rotations(P.shape[1])
-    on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a, P)], axis=1)
-    on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b, -P)], axis=1)
+    points, along = len(P) - _rows(arms), P[len(P) - _rows(arms) :, :1]
+    P = P[:points]
+    on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a[:points], P)], axis=1)
+    on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b[:points], -P)], axis=1)
+    if arms.jac is not None:
+        on_a, on_b = (jnp.concatenate([on, along * arms.jac[:, side]]) for side, on in enumerate((on_a, on_b)))
     total = side_sum(on_a, on_b, arms.a, arms.b, moving)
     return total[:, : so.D], total[:, so.D :]
 
@@ -64,7 +73,23 @@ def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
     def point_velocity(at, arm):
         return at[: so.D] + so.cross(at[so.D :], arm)
 
-    return jax.vmap(point_velocity)(at_a, arms.arm_a) - jax.vmap(point_velocity)(at_b, arms.arm_b)
+    points = len(arms.a) - _rows(arms)
+    on_a, on_b = (
+        jax.vmap(point_velocity)(at[:points], arm[:points]) for at, arm in ((at_a, arms.arm_a), (at_b, arms.arm_b))
+    )
+    if arms.jac is None:
+        return on_a - on_b
+    rates = (arms.jac * jnp.stack([at_a[points:], at_b[points:]], axis=1)).sum((1, 2))
+    return jnp.concatenate([on_a - on_b, _first(rates, so.D)])
+
+
+def _rows(arms: Any) -> int:
+    return 0 if arms.jac is None else len(arms.jac)
+
+
+def _first(values: Array, D: int) -> Array:
+    """Numbers (R, *batch) as the first component of vectors, (R, D, *batch)."""
+    return values[:, None] * unit_vector(jnp.zeros((D, *values.shape[1:]), values.dtype), 0)[None]
 
 
 def twists(P: Array, arms: Any, mobility: Mobility) -> Array:
@@ -83,6 +108,10 @@ def bodies_inverse(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     so = rotations(D)
     size = D + so.A
     J_a, J_b = (jax.vmap(lambda arm: _by_units(so, arm))(arm) for arm in (arms.arm_a, arms.arm_b))  # (C, size, D)
+    if arms.jac is not None:
+        points, by_twist = len(arms.a) - len(arms.jac), jax.vmap(lambda jac: _first(jac, D))
+        J_a = jnp.concatenate([J_a[:points], by_twist(arms.jac[:, 0])])
+        J_b = jnp.concatenate([J_b[:points], -by_twist(arms.jac[:, 1])])
 
     def answers(J):  # of each contact to unit twists of one of its bodies: impulses
         return jnp.swapaxes(jax.vmap(answer)(jnp.swapaxes(J, 0, 1)), 0, 1)

@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.contact.cone import Cone, nearest
 from diffrigid.contact.mobility import Mobility, bodies_inverse, relative_changes, twists
-from diffrigid.numerics import dot, norm, safe_divide
+from diffrigid.numerics import dot, norm
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most
@@ -32,11 +33,10 @@ READY = 1e-2  # [-] of u: an error of the inner problem at which the multipliers
 HALVINGS = 10  # of a step along its line
 
 
-def solve_roughly(cone: Any, v_rel: Array, arms: Any, mobility: Mobility, error: Callable, enough: Array) -> Array:
+def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error: Callable, enough: Array) -> Array:
     """Impulses of the C contacts, (C, D, *batch) [N s].
 
     Args:
-        cone: with the fields of `Cone`.
         error: of impulses, (*batch): that of the best is returned.
         enough: (*batch) error at which to stop.
     """
@@ -77,17 +77,6 @@ def solve_roughly(cone: Any, v_rel: Array, arms: Any, mobility: Mobility, error:
     u, least = twists(nothing, arms, mobility), jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
     busy = lambda carry: (carry[0] < ROUNDS) & jnp.any(carry[-1] > enough)  # noqa: E731
     return lax.while_loop(busy, again, (0, u, nothing, nothing, least))[3]
-
-
-def nearest(cone: Any, z: Array) -> Array:
-    """Projection onto the cones of friction, (C, D, *batch)."""
-    z_n = jax.vmap(dot)(cone.normal, z)
-    z_t = z - z_n[:, None] * cone.normal
-    size, mu = jax.vmap(norm)(z_t), cone.mu
-    sticks, parts = size <= mu * z_n, mu * size <= -z_n
-    push = jnp.where(sticks, z_n, jnp.where(parts, 0.0, (z_n + mu * size) / (1.0 + mu**2)))
-    share = jnp.where(sticks, 1.0, safe_divide(mu * push, size))
-    return cone.on[:, None] * (push[:, None] * cone.normal + share[:, None] * z_t)
 
 
 def _down(slope: Callable, whole: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The contacts of all pairs of a world as one list, whatever their kinds."""
+"""The contacts of all pairs of a world, and the rows of its joints, as one list, whatever their kinds."""
 
 from typing import Any
 
@@ -11,6 +11,7 @@ from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
+from diffrigid.contact.stops import find_stops, is_drive, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
 from diffrigid.numerics import apart, constant, dot, norm, rows
@@ -29,11 +30,16 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
         each = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, at_end, width))
         part = apart(jnp.any(dt > 0), each, *sides_of(world, pairs, flight, since))
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
+    jac = None
+    if stops_of(world):
+        stops = find_stops(world, flight, since, dt, at_end)
+        jac = stops.jac
+        parts.append(replace(stops, jac=None))
     if len(parts) > 1:
         strikes = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
     else:
         strikes = parts[0]
-    return replace(strikes, **ends(world))
+    return replace(strikes, **ends(world), jac=jac)
 
 
 def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Strikes:
@@ -95,17 +101,20 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
         return jnp.any(apart <= dt * (closing + 0.5 * dt * pull) + margin)
 
     since = jnp.zeros_like(flight.t0)
+    if stops_of(world):
+        return jnp.asarray(True)
     near = [jnp.any(jax.vmap(one)(*sides_of(world, pairs, flight, since))) for pairs in world.pairs]
     return jnp.any(jnp.stack(near))
 
 
 def ends(world: Any) -> dict[str, tuple[int, ...]]:
-    """Colliders a and b of every contact of the list."""
+    """Colliders a and b of every contact of the list, and of the rows of joints after them."""
 
     def column(of):
         return tuple(int(i) for pairs in world.pairs for i in np.repeat(of(pairs), pairs.count))
 
-    return {"a": column(lambda pairs: pairs.a), "b": column(lambda pairs: pairs.b)}
+    a, b = column(lambda pairs: pairs.a), column(lambda pairs: pairs.b)
+    return {"a": a + stop_ends(world, "a"), "b": b + stop_ends(world, "b")}
 
 
 def _acceleration(at_a, at_b) -> Array:
@@ -133,6 +142,41 @@ def material(world: Any, name: str, colliders: tuple[int, ...]) -> Material:
     own = getattr(world, f"own_{name}")
     given = constant(tuple(float(own[i]) for i in colliders), str(values.dtype))
     return Material(value=rows(values, colliders), given=lax.expand_dims(given, range(1, values.ndim)))
+
+
+def coefficients(world: Any, batch: tuple[int, ...]) -> tuple[Array, Array]:
+    """Restitution and friction of all contacts and rows, (C, *batch) [-] or what broadcasts."""
+    index = {side: ends(world)[side][: contact_count(world)] for side in "ab"}
+    limits = ("lower", "upper")
+    both = []
+    for name in MATERIALS:
+        parts = [mixed(*(material(world, name, index[side]) for side in "ab"))] if world.pairs else []
+        if stops_of(world):
+            parts.append(of_stops(world, "restitution", limits if name == "restitution" else (), 0.0, batch))
+        whole = [jnp.broadcast_to(part, part.shape[:1] + batch) for part in parts]
+        both.append(jnp.concatenate(whole) if len(parts) > 1 else parts[0])
+    return both[0], both[1]
+
+
+def driven(world: Any) -> tuple[bool, ...]:
+    """Of all contacts and rows: friction or a motor of a joint, which acts to both sides, in every step."""
+    return (False,) * contact_count(world) + is_drive(world)
+
+
+def driving(world: Any, target: Array) -> tuple[Array, Array | None]:
+    """`target` with the speeds of motors put in, and the most that friction and motors do [N or N m]; None: no such."""
+    if not any(is_drive(world)):
+        return target, None
+    drives = jnp.asarray(constant(is_drive(world), "bool")).reshape(-1, *[1] * (target.ndim - 1))
+    speed, force = (of_stops(world, name, ("friction",), 0.0, target.shape[1:]) for name in ("speed", "friction"))
+    points = contact_count(world)
+    target = jnp.concatenate([target[:points], jnp.where(drives, speed, target[points:])])
+    return target, jnp.concatenate([jnp.zeros_like(target[:points]), force])
+
+
+def contact_count(world: Any) -> int:
+    """Contacts of all pairs, without the rows of joints."""
+    return sum(len(pairs.a) * pairs.count for pairs in world.pairs)
 
 
 def mixed(a: Material, b: Material) -> Array:
