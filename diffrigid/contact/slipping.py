@@ -51,7 +51,7 @@ def stopping_early(strikes: Strikes, P: Array, law: tuple[Array, Array, Array | 
     speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     bounds = mu * jax.vmap(dot)(n, P)
-    bounds = bounds if of_joint is None else jnp.where(of_joint, most, bounds)
+    bounds = bounds if most is None else jnp.where(jnp.isfinite(most), most, bounds)
     size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
     whole = jnp.where(speed > CREEP, at_end_speed * bound + size * (speed - along), 0.0)
     share = safe_divide(speed * size, whole)  # tau / T
