@@ -234,7 +234,7 @@ function makeView(canvas, scene, redraw) {
       if (!impact[row]) continue;
       pen.beginPath(); pen.arc(x, y, 5 + 10 * (1 - opacity), 0, 7); pen.stroke();
       arrow(pen, [x, y], [(64 * ix[row]) / hardest, (-64 * iy[row]) / hardest]);
-      if (size > 0.02 * hardest) pen.fillText(`${+size.toPrecision(3)} N s`, x + 12, y - 8);
+      if (size > 0.02 * hardest) pen.fillText(`${size >= 1e3 || size < 1e-3 ? +size.toPrecision(3) : size.toPrecision(3)} N s`, x + 12, y - 8);
     }
     pen.globalAlpha = 1;
   }

@@ -19,6 +19,7 @@ from diffrigid.state import State, kinetic_energy
 from diffrigid.step import Trajectory
 from diffrigid.sysid.residuals import Column, columns
 from diffrigid.view.contacts import find_contacts
+from diffrigid.view.touch import rotated
 from diffrigid.world import World
 
 LEVELS = 65534  # of a packed number; 65535 is NaN
@@ -41,9 +42,9 @@ def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
         )
     if np.ndim(trajectory.state.x) != 3 or batch_rank(trajectory.world):
         raise ValueError(
-            f"{name}.state.x has shape {np.shape(trajectory.state.x)}, expected (T+1, N, D): a batch of worlds. Pick one: "
-            f"replace({name}, state=jax.tree.map(lambda leaf: leaf[..., 0], {name}.state)), and so the leaves of "
-            "the world that have a batch axis"
+            f"{name}.state.x has shape {np.shape(trajectory.state.x)}, expected (T+1, N, D), and {name}.world without a "
+            f"batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[..., 0], {name}.state)), "
+            "and likewise in the leaves of the world that have the batch axis"
         )
     return trajectory
 
@@ -172,15 +173,6 @@ def _ends(spring: SpringDamper):
 def _point(x, q, body, anchor):
     """World positions (T, D) of an anchor on a body, or of a world point."""
     return np.broadcast_to(anchor, x[:, 0].shape) if body is None else x[:, body] + rotated(q[:, body], anchor)
-
-
-def rotated(q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Vectors (..., D) from body to world axes; q (..., Q) and r broadcast."""
-    if q.shape[-1] == 2:
-        c, s, x, y = q[..., 0], q[..., 1], r[..., 0], r[..., 1]
-        return np.stack([c * x - s * y, s * x + c * y], axis=-1)
-    t = 2.0 * np.cross(q[..., 1:], r)
-    return r + q[..., :1] * t + np.cross(q[..., 1:], t)
 
 
 def measured(world: World, data: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from diffrigid.view.frames import checked, record
 from diffrigid.step import Trajectory
+from diffrigid.view.frames import checked, record
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"  # nothing is ever loaded
 SHOWN = ("trails", "velocities", "contacts", "data")  # what can be shown or hidden
@@ -74,8 +74,11 @@ def play(
     Raises:
         ValueError: a batch of trajectories, dimensions that differ, unknown columns or names.
     """
-    runs = {str(name): checked(run, f"trajectory[{name!r}]") for name, run in trajectory.items()} if isinstance(
-        trajectory, Mapping) else {"": checked(trajectory)}
+    runs = (
+        {str(name): checked(run, f"trajectory[{name!r}]") for name, run in trajectory.items()}
+        if isinstance(trajectory, Mapping)
+        else {"": checked(trajectory)}
+    )
     _check(runs, show, theme, speed, frames)
     by_run = _data_by_run(runs, data)
     dim = next(iter(runs.values())).world.dim

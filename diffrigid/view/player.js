@@ -158,6 +158,7 @@ function makeKey(parent, scene) {
   if (scene.overlaid) scene.runs.forEach((run) => line(scene.of(run, 0), run.name));
   else if (scene.runs[0].bodies.length <= 8 && !scene.beside) scene.runs[0].bodies.forEach((name, body) => line(scene.of(scene.runs[0], body), name));
   if (scene.runs.some((run) => run.seen) && scene.show.has("data")) line("none", "measured", "dashed");
+  if (scene.unit) element(key, "span", {}, scene.unit);
   return key;
 }
 
@@ -214,7 +215,7 @@ function makePlayer(data) {
     toggle(text, scene.show.has(name), (on) => scene.show[on ? "add" : "delete"](name));
   }
   graph.choice(bar);
-  element(bar, "button", { type: "button" }, "Whole view").addEventListener("click", () => { view.fit(); draw(); });
+  element(bar, "button", { type: "button", title: "whole view", "aria-label": "whole view" }, "⤢").addEventListener("click", () => { view.fit(); draw(); });
   scene.refresh = () => { key?.remove(); key = makeKey(stage, scene); graph.redo(); draw(); };
   scene.seek = (time) => { play(false); show(time); };
   button.addEventListener("click", () => play(!playing));
@@ -280,7 +281,7 @@ function makeGraph(parent, scene) {
     let at = left + 90;
     for (const line of all) {
       pen.strokeStyle = pen.fillStyle = line.colour; pen.lineWidth = 1.6; pen.setLineDash(line.dash ?? []);
-      if (line.name && (!scene.overlaid || true)) { pen.fillText(line.name, at, 11); at += pen.measureText(line.name).width + 14; }
+      if (line.name) { pen.fillText(line.name, at, 11); at += pen.measureText(line.name).width + 14; }
       let pending = true;
       pen.beginPath();
       line.t.forEach((t, k) => {
