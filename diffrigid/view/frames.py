@@ -42,8 +42,8 @@ def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
         )
     if np.ndim(trajectory.state.x) != 3 or batch_rank(trajectory.world):
         raise ValueError(
-            f"{name}.state.x has shape {np.shape(trajectory.state.x)}, expected (T+1, N, D), and {name}.world without a "
-            f"batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[..., 0], {name}.state)), "
+            f"{name}.state.x has shape {np.shape(trajectory.state.x)}, expected (T+1, N, D), and {name}.world without "
+            f"a batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[..., 0], {name}.state)), "
             "and likewise in the leaves of the world that have the batch axis"
         )
     return trajectory

@@ -20,6 +20,10 @@ from diffrigid.view.frames import checked, record
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"  # nothing is ever loaded
 SHOWN = ("trails", "velocities", "contacts", "data")  # what can be shown or hidden
 THEMES = ("auto", "light", "dark")
+PLOTS = {
+    2: ("energy", "speed", "x", "y", "angle", "vx", "vy", ""),
+    3: ("energy", "speed", "x", "y", "z", "vx", "vy", "vz", ""),
+}
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ def play(
         beside: several trajectories side by side.
         speed: at which it starts; 1 is real time.
         show: what is shown at first, of "trails", "velocities", "contacts", "data".
-        plot: "energy", "x", "y", "z" (3D), "angle" (2D), "speed", or "" for none.
+        plot: "energy", "speed", "x", "y", "z" (3D), "angle" (2D), "vx", "vy", "vz", or "" for none.
         frames: the most times that are kept, evenly; between them bodies move on curves through positions and
             velocities, with a corner at an impact.
         height: [px] of the player in a notebook.
@@ -82,6 +86,8 @@ def play(
     _check(runs, show, theme, speed, frames)
     by_run = _data_by_run(runs, data)
     dim = next(iter(runs.values())).world.dim
+    if plot not in PLOTS[dim]:
+        raise ValueError(f"plot is {plot!r}: expected one of {PLOTS[dim]}")
     content = {
         "dim": dim, "beside": bool(beside), "speed": float(speed), "show": sorted(set(show)), "plot": plot,
         "runs": [record(run, name, by_run[name], frames) for name, run in runs.items()],

@@ -30,29 +30,37 @@ function before(times, t) {
   return low;
 }
 
-// How a body moves from x0 to x1 in h seconds with velocities v0 and v1 at the ends: time and place of a corner if two
-// straight lines fit better than a curve, which means an impact; "line" if nothing fits.
-function passage(x0, v0, x1, v1, h) {
+// How a body moves between two frames, h seconds apart, from x0 with v0 to x1 with v1: on a "curve"; or with a corner
+// {s, x} where two straight lines meet, if the velocity jumps, which means an impact; or on a "line" if nothing fits.
+// `calm` is the square of the change of velocity in the intervals beside.
+function passage({ x: x0, v: v0 }, { x: x1, v: v1 }, h, calm) {
   let jump = 0, off = 0, pull = 0, apart = 0;
   x0.forEach((x, i) => {
     jump += (v1[i] - v0[i]) ** 2;
     off += (x1[i] - x - (h * (v0[i] + v1[i])) / 2) ** 2;
     pull += (x1[i] - x - v1[i] * h) * (v0[i] - v1[i]);
   });
-  if (off <= (0.05 * h) ** 2 * jump || jump === 0) return off <= 1e-12 + (0.05 * h) ** 2 * jump ? "curve" : "line";
-  const s = pull / jump;
-  const ends = x0.map((x, i) => [x + v0[i] * s, x1[i] - v1[i] * (h - s)]);
+  const smooth = off <= 1e-12 + (0.05 * h) ** 2 * jump;
+  if (smooth && jump <= 9 * calm) return "curve";
+  const s = pull / jump, ends = x0.map((x, i) => [x + v0[i] * s, x1[i] - v1[i] * (h - s)]);
   for (const [a, b] of ends) apart += (a - b) ** 2;
-  if (!(s > 0 && s < h) || apart > (0.25 * h) ** 2 * jump) return "line";
+  if (!(s > 0 && s < h) || apart > (0.25 * h) ** 2 * jump) return smooth ? "curve" : "line";
   return { s, x: ends.map(([a, b]) => (a + b) / 2) };
 }
 
-function between(x0, v0, x1, v1, h, s) {
-  const u = s / h, way = passage(x0, v0, x1, v1, h), mix = (a, b, u) => a.map((n, i) => n + (b[i] - n) * u);
+// Place and velocity s seconds after x0.
+function between({ x: x0, v: v0 }, { x: x1, v: v1 }, h, way, s) {
+  const u = s / h, mix = (a, b, u) => a.map((n, i) => n + (b[i] - n) * u);
   if (way === "line") return { x: mix(x0, x1, u), v: mix(v0, v1, u) };
   if (way !== "curve") return s < way.s ? { x: mix(x0, way.x, s / way.s), v: v0 } : { x: mix(way.x, x1, (s - way.s) / (h - way.s)), v: v1 };
   const x = x0.map((a, i) => (1 + 2 * u) * (1 - u) ** 2 * a + u * u * (3 - 2 * u) * x1[i] + h * u * (1 - u) * ((1 - u) * v0[i] - u * v1[i]));
   return { x, v: mix(v0, v1, u) };
+}
+
+// All passages of a body.
+function passages(states, t) {
+  const jump = states.slice(1).map(({ v }, k) => v.reduce((sum, n, i) => sum + (n - states[k].v[i]) ** 2, 0));
+  return jump.map((_, k) => passage(states[k], states[k + 1], t[k + 1] - t[k], jump.length < 2 ? Infinity : Math.max(jump[k - 1] ?? 0, jump[k + 1] ?? 0)));
 }
 
 function turned(a, b, u) {
@@ -75,19 +83,12 @@ function makeRun(source, dim) {
   run.pose = (body, time) => {
     const k = Math.min(before(t, time), t.length - 2), a = run.at(body, k), b = run.at(body, k + 1), h = t[k + 1] - t[k];
     const s = Math.min(Math.max(time - t[k], 0), h);
-    return s === 0 ? a : s === h ? b : { ...between(a.x, a.v, b.x, b.v, h, s), q: turned(a.q, b.q, s / h) };
+    return s === 0 ? a : s === h ? b : { ...between(a, b, h, ways[body][k], s), q: turned(a.q, b.q, s / h) };
   };
-  run.trails = source.bodies.map((_, body) => {
-    const points = [];
-    for (let k = 0; k < t.length; k++) {
-      const a = run.at(body, k);
-      points.push([t[k], ...a.x]);
-      if (k + 1 === t.length) break;
-      const b = run.at(body, k + 1), way = passage(a.x, a.v, b.x, b.v, t[k + 1] - t[k]);
-      if (way.s) points.push([t[k] + way.s, ...way.x]);
-    }
-    return points;
-  });
+  const ways = source.bodies.map((_, body) => passages(Array.from(t, (_, k) => run.at(body, k)), t));
+  run.trails = ways.map((ways, body) => [...t].flatMap((time, k) => [
+    [time, ...run.at(body, k).x], ...(ways[k]?.s ? [[time + ways[k].s, ...ways[k].x]] : []),
+  ]));
   const still = source.statics.map((pose) => ({ x: pose.slice(0, dim), q: dim === 2 ? [Math.atan2(pose[3], pose[2])] : pose.slice(dim) }));
   const world = { x: Array(dim).fill(0), q: dim === 2 ? [0] : [1, 0, 0, 0] };
   run.poses = (time) => [...source.bodies.map((_, body) => run.pose(body, time)), ...still, world];
