@@ -217,7 +217,7 @@ function makePlayer(data) {
   }
   graph.choice(bar);
   element(bar, "button", { type: "button", title: "whole view", "aria-label": "whole view" }, "⤢").addEventListener("click", () => { view.fit(); draw(); });
-  scene.refresh = () => { key?.remove(); key = makeKey(stage, scene); graph.redo(); draw(); };
+  scene.refresh = () => { key?.remove(); key = makeKey(stage, scene); view.redye?.(); graph.redo(); draw(); };
   scene.seek = (time) => { play(false); show(time); };
   button.addEventListener("click", () => play(!playing));
   scrub.addEventListener("input", () => scene.seek(Number(scrub.value)));

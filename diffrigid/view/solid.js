@@ -194,7 +194,6 @@ function makeView(canvas, scene, redraw) {
     renderer.setPixelRatio(window.devicePixelRatio || 1);
     renderer.setSize(width, height, false);
     renderer.setScissorTest(cells.length > 1);
-    view.paints.forEach(dye);
     camera.aspect = grid.w / grid.h;
     camera.updateProjectionMatrix();
     stages.forEach((cell, n) => {
@@ -221,7 +220,7 @@ function makeView(canvas, scene, redraw) {
     controls.update();
   }
   const view = {
-    draw, fit, drawn: [], paints: [],
+    draw, fit, drawn: [], paints: [], redye: () => view.paints.forEach(dye),
     paint: (...pair) => { view.paints.push(pair); dye(pair); return pair[0]; },
     zoom: (factor) => { camera.position.sub(controls.target).divideScalar(factor).add(controls.target); controls.update(); redraw(); },
   };
