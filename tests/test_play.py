@@ -120,6 +120,7 @@ def test_measured_columns_are_kept_with_what_is_missing():
     run = bounce()
     t = T[::3] + 1e-3
     x = np.where(np.arange(len(t))[:, None] == 4, np.nan, np.stack([t, 2 * t], axis=1))
+    turns = 2 * np.pi * (np.arange(len(t)) % 2)  # of a measured angle do not count
     seen = content(dr.play(run, {"t": t, "block.x": x, "block.q": np.stack([np.cos(t), np.sin(t)], axis=1)}))["runs"][
         0
     ]["measured"]
@@ -127,8 +128,9 @@ def test_measured_columns_are_kept_with_what_is_missing():
     assert seen["bodies"] == [1]
     np.testing.assert_allclose(table[:, :3], np.column_stack([x, t]), atol=error.max())
     assert np.isnan(table[:, 3:]).all() and np.isnan(table[4, :2]).all()
-    by_run = content(dr.play({"a": run, "b": run}, {"b": {"t": t, "ball.angle": t}}))["runs"]
+    by_run = content(dr.play({"a": run, "b": run}, {"b": {"t": t, "ball.angle": 3 * t + turns}}))["runs"]
     assert by_run[0]["measured"] is None and by_run[1]["measured"]["bodies"] == [0]
+    np.testing.assert_allclose(unpacked(by_run[1]["measured"]["poses"])[0][:, 2], 3 * t, atol=1e-4)
 
 
 # ---- contacts and energies

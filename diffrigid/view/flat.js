@@ -227,14 +227,15 @@ function makeView(canvas, scene, redraw) {
   function contacts({ pen, at }, run) {
     const [, impact, px, py, ix, iy] = run.contacts;
     pen.strokeStyle = pen.fillStyle = scene.colour("mark"); pen.font = "12px system-ui, sans-serif"; pen.lineWidth = 2;
-    for (const [opacity, row] of scene.marks(run)) {
+    const seen = scene.marks(run), few = seen.length <= 12;
+    for (const [opacity, row] of seen) {
       const [x, y] = at([px[row], py[row]]), size = Math.hypot(ix[row], iy[row]);
       pen.globalAlpha = opacity;
       pen.beginPath(); pen.arc(x, y, impact[row] ? 3 : 2.4, 0, 7); pen.fill();
       if (!impact[row]) continue;
       pen.beginPath(); pen.arc(x, y, 5 + 10 * (1 - opacity), 0, 7); pen.stroke();
       arrow(pen, [x, y], [(64 * ix[row]) / hardest, (-64 * iy[row]) / hardest]);
-      if (size > 0.02 * hardest) pen.fillText(`${size >= 1e3 || size < 1e-3 ? +size.toPrecision(3) : size.toPrecision(3)} N s`, x + 12, y - 8);
+      if (few && size > 0.02 * hardest) pen.fillText(`${size >= 1e3 || size < 1e-3 ? +size.toPrecision(3) : size.toPrecision(3)} N s`, x + 12, y - 8);
     }
     pen.globalAlpha = 1;
   }

@@ -79,18 +79,18 @@ def record(trajectory: Trajectory, name: str, data: Mapping[str, Any] | None, fr
     world, t = trajectory.world, np.asarray(trajectory.t, float)
     kept = np.unique(np.rint(np.linspace(0, len(t) - 1, min(len(t), frames))).astype(int))
     some = jax.tree.map(lambda leaf: np.asarray(leaf, float)[kept], trajectory.state)
-    marks = find_contacts(trajectory, t[kept])
+    table, marks = poses(some), find_contacts(trajectory, t[kept])
     return {
         "name": name,
         "bodies": list(world.names),
         "t": times(t[kept]),
-        "poses": pack(poses(some)),
+        "poses": pack(table),
         "statics": np.round(np.concatenate([world.statics.x, world.statics.q], axis=1), 7).tolist(),
         "shapes": shapes(world),
         "joints": links(world),
         "energy": pack(energies(world, some)),
         "contacts": pack(marks),
-        "measured": None if data is None else measured(world, data),
+        "measured": None if data is None else measured(world, data, t[kept], table),
     }
 
 
@@ -175,13 +175,20 @@ def _point(x, q, body, anchor):
     return np.broadcast_to(anchor, x[:, 0].shape) if body is None else x[:, body] + rotated(q[:, body], anchor)
 
 
-def measured(world: World, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns of a record, checked as `fit` does: poses like those of `poses` where they are known, else NaN."""
+def measured(world: World, data: Mapping[str, Any], t_drawn: np.ndarray, drawn: np.ndarray) -> dict[str, Any]:
+    """Columns of a record, checked as `fit` does: poses like those of `poses` where they are known, else NaN.
+
+    Angles are those of the turn that is nearest to what is drawn, `drawn` (T, K) at t_drawn (T,) [s].
+    """
     t, found = columns(world, data)
     table = np.full((len(t), len(world.names), 5 if world.dim == 2 else 10), np.nan)
     for column in found:
         for place, values in _places(column, world.dim):
             table[:, column.row, place] = values
+    if world.dim == 2:
+        for row, angle in enumerate(table[:, :, 2].T):
+            away = np.interp(t, t_drawn, drawn[:, 5 * row + 2]) - angle
+            table[:, row, 2] += 2 * np.pi * np.round(away / (2 * np.pi))
     used = sorted({column.row for column in found})
     return {"t": times(t), "bodies": used, "poses": pack(table[:, used].reshape(len(t), -1))}
 

@@ -117,9 +117,9 @@ function makeScene(data) {
   const scene = {
     ...data, runs, show: new Set(data.show), speed: data.speed,
     first: Math.min(...runs.map((run) => run.first)), last: Math.max(...runs.map((run) => run.last)),
-    overlaid: runs.length > 1 && !data.beside,
+    overlaid: runs.length > 1 && !data.beside, byRun: runs.length > 1 && (!data.beside || runs.every((run) => run.bodies.length === 1)),
     colour: (name) => (known[name] ??= getComputedStyle(root).getPropertyValue(`--${name}`).trim()),
-    of: (run, body) => scene.colour(`c${(scene.overlaid ? runs.indexOf(run) : body) % 8}`),
+    of: (run, body) => scene.colour(`c${(scene.byRun ? runs.indexOf(run) : body) % 8}`),
     adopt: () => { root.dataset.theme = theme === "auto" ? (dark.matches ? "dark" : "light") : theme; known = {}; },
     // Contacts of a run that are seen now, as [opacity, columns of marks, row].
     marks: (run) => {
