@@ -51,7 +51,7 @@ class Motion(NamedTuple):
 
 
 def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
-    """Rows by time: t [s], 1 for an impact or 0 for rest, point (D) [m], impulse (D) [N s] on one of the two.
+    """Rows by time: t [s], 1 for an impact or 0 for rest, point (D) [m], impulse (D) [N s] on one that moves.
 
     Args:
         t_drawn: (F,) [s] times that are drawn; resting contacts are given only for intervals that begin then.
@@ -64,6 +64,7 @@ def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
     if touch is None or not len(touch.s):
         return np.zeros((0, 2 + 2 * dim))
     impulse = _impulses(world, motion, touch, dp, dL)
+    impulse = np.where(touch.a[:, None] < len(world.names), impulse, -impulse)
     size, ends = np.linalg.norm(impulse, axis=1), np.stack([touch.a, touch.b], axis=1)
     moved = np.concatenate([push, np.zeros((len(push), len(world.static_names)))], axis=1)
     rough = size > ROUGH * moved[touch.interval[:, None], ends].max(1)

@@ -84,7 +84,7 @@ def play(
         else {"": checked(trajectory)}
     )
     _check(runs, show, theme, speed, frames)
-    by_run = _data_by_run(runs, data)
+    by_run = _data_by_run(runs, data, beside)
     dim = next(iter(runs.values())).world.dim
     if plot not in PLOTS[dim]:
         raise ValueError(f"plot is {plot!r}: expected one of {PLOTS[dim]}")
@@ -107,13 +107,13 @@ def _check(runs: Mapping[str, Trajectory], show: Iterable[str], theme: str, spee
         raise ValueError(f"play: expected speed > 0 and frames >= 2, got {speed} and {frames}")
 
 
-def _data_by_run(runs: Mapping[str, Trajectory], data: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The columns of each trajectory: the same for all, or by name."""
+def _data_by_run(runs: Mapping[str, Trajectory], data: Mapping[str, Any] | None, beside: bool) -> dict[str, Any]:
+    """The columns of each trajectory: by name, or the same for all, which are drawn once."""
     if data is not None and "t" not in data and data and all(isinstance(part, Mapping) for part in data.values()):
         if unknown := set(data) - set(runs):
             raise ValueError(f"data has {sorted(unknown)}: expected names of trajectories, {sorted(runs)}")
         return {name: data.get(name) for name in runs}
-    return dict.fromkeys(runs, data)
+    return {name: data if beside or n == 0 else None for n, name in enumerate(runs)}
 
 
 def _page(content: Mapping[str, Any], dim: int, theme: str, title: str) -> str:

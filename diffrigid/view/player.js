@@ -260,7 +260,7 @@ function makeGraph(parent, scene) {
     return scene.runs.flatMap((run) => run.bodies.map((name, body) => ({
       t: run.t, y: Float64Array.from(run.t, (_, k) => value(chosen, run.at(body, k))), colour: scene.of(run, body), dash: [], name: "",
     })).concat(!run.seen || !scene.show.has("data") ? [] : run.seen.bodies.map((body, j) => ({
-      t: run.seen.t, y: Float64Array.from(run.seen.t, (_, k) => value(chosen, run.seen.at(j, k))), colour: scene.of(run, body), dots: true, name: "",
+      t: run.seen.t, y: Float64Array.from(run.seen.t, (_, k) => value(chosen, run.seen.at(j, k))), colour: scene.overlaid ? scene.colour("ghost") : scene.of(run, body), dots: true, name: "",
     }))));
   }
   function paint(pen, width, height) {

@@ -95,7 +95,10 @@ function makeView(canvas, scene, redraw) {
   }
   function arrow(colour) {
     const made = new THREE.ArrowHelper(new THREE.Vector3(1, 0, 0), new THREE.Vector3(), 1);
-    for (const part of [made.line, made.cone]) view.paint(part.material, colour);
+    for (const part of [made.line, made.cone]) {
+      Object.assign(view.paint(part.material, colour), { depthTest: false, transparent: true }); // seen through bodies
+      part.renderOrder = 1;
+    }
     return made;
   }
   function aim(arrow, x, along) {
