@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_play import DOWN, HEIGHT, IMPACT, MASS, RADIUS, E, G, T, bounce
+from motions import DOWN, HEIGHT, IMPACT, MASS, RADIUS, E, G, T, bounce
 
 import diffrigid as dr
 from diffrigid import view

@@ -46,14 +46,13 @@ def film(trajectory: Trajectory, path: str | Path, speed: float = 1.0, rate: int
         raise ValueError(f"film: cannot write {path.name!r}: use .gif, which needs pillow, or .mp4, which needs ffmpeg")
     x, q, shapes, t = *_poses(trajectory), _outlines(world), np.asarray(trajectory.t, float)
     _stage(ax, world, x, shapes)
-    moving = [
-        (owner, lines, ax.plot([], [], color=f"C{owner}")[0]) for owner, lines in shapes if owner < len(world.names)
-    ]
+    moving = [(owner, lines) for owner, lines in shapes if owner < len(world.names)]
+    curves = [ax.plot([], [], color=f"C{owner}")[0] for owner, _ in moving]
     writer = kinds[path.suffix](fps=rate)
     with writer.saving(ax.figure, path, dpi=100):
         for now in np.arange(t[0], t[-1] + 1e-9, speed / rate):
             n = int(np.abs(t - now).argmin())
-            for owner, lines, curve in moving:
+            for (owner, lines), curve in zip(moving, curves, strict=True):
                 curve.set_data(*(x[n, owner] + rotated(q[n, owner], lines)).T)
             writer.grab_frame()
     pyplot.close(ax.figure)

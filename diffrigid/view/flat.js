@@ -1,4 +1,3 @@
-"use strict";
 // The motion in 2D, on a canvas.
 
 const MARGIN = 28; // [px] around the motion

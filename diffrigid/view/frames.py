@@ -79,7 +79,7 @@ def record(trajectory: Trajectory, name: str, data: Mapping[str, Any] | None, fr
     world, t = trajectory.world, np.asarray(trajectory.t, float)
     kept = np.unique(np.rint(np.linspace(0, len(t) - 1, min(len(t), frames))).astype(int))
     some = jax.tree.map(lambda leaf: np.asarray(leaf, float)[kept], trajectory.state)
-    table, marks = poses(some), find_contacts(trajectory, t[kept])
+    table, marks = poses(trajectory)[kept], find_contacts(trajectory, t[kept])
     return {
         "name": name,
         "bodies": list(world.names),
@@ -94,11 +94,20 @@ def record(trajectory: Trajectory, name: str, data: Mapping[str, Any] | None, fr
     }
 
 
-def poses(state: State) -> np.ndarray:
+def poses(trajectory: Trajectory) -> np.ndarray:
     """Columns of every body, in 2D x, y, angle, vx, vy, in 3D x, y, z, q (4), v (3); [m], [rad], [m/s]."""
-    x, q, v = np.asarray(state.x, float), np.asarray(state.q, float), np.asarray(state.v, float)
-    turn = np.unwrap(np.arctan2(q[:, :, 1], q[:, :, 0]), axis=0)[:, :, None] if x.shape[2] == 2 else _near(q)
+    x, q, v, w = (np.asarray(getattr(trajectory.state, name), float) for name in "xqvw")
+    turn = _turns(np.asarray(trajectory.t, float), q, w) if x.shape[2] == 2 else _near(q)
     return np.concatenate([x, turn, v], axis=2).reshape(len(x), -1)
+
+
+def _turns(t: np.ndarray, q: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Angles (T, N, 1), with as many turns as the angular velocities say, however fast."""
+    angle = np.arctan2(q[:, :, 1:], q[:, :, :1])
+    expected = np.diff(t)[:, None, None] * (w[1:] + w[:-1]) / 2
+    away = np.diff(angle, axis=0) - expected
+    steps = expected + away - 2 * np.pi * np.round(away / (2 * np.pi))
+    return np.concatenate([angle[:1], angle[:1] + np.cumsum(steps, axis=0)])
 
 
 def _near(q: np.ndarray) -> np.ndarray:

@@ -1,4 +1,3 @@
-"use strict";
 // The controls of a player, its clock and its graph. What draws the motion is `makeView`, in flat.js or solid.js.
 
 const SPEEDS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10];

@@ -1,4 +1,3 @@
-"use strict";
 // The motion in 3D, with three.js: shaded solids, orbit controls. z is up.
 
 function makeView(canvas, scene, redraw) {
@@ -235,4 +234,6 @@ function makeView(canvas, scene, redraw) {
   return view;
 }
 
-const player = makePlayer(JSON.parse(document.getElementById("data").textContent));
+const able = document.createElement("canvas").getContext("webgl2");
+if (!able) element(document.body, "p", {}, "A motion in 3D is drawn with WebGL, which this browser does not have, or not switched on.");
+const player = able && makePlayer(JSON.parse(document.getElementById("data").textContent));
