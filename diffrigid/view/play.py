@@ -1,8 +1,9 @@
 """`play`: a trajectory, or several, as one piece of HTML that needs nothing else.
 
-The page is made of a style (`player.css`), the controls (`player.js`), a way of drawing (`flat.js` on a canvas in 2D,
-`solid.js` with three.js in 3D) and the data of `frames`. A notebook shows it in a frame of its own, so that two
-players do not meet, and its policy allows no load of anything.
+The page is made of a style (`player.css`), the controls (`player.js`, `graph.js`), a way of drawing (`flat.js` on a
+canvas in 2D, `solid.js` with three.js in 3D) and the data of `frames`. A notebook shows it in a frame of its own, so
+that two players do not meet, and its policy allows no load of anything. `three/package.json` says how the bundled part
+of three.js is made.
 """
 
 import base64
@@ -144,7 +145,7 @@ def _page(content: Mapping[str, Any], dim: int, theme: str, title: str) -> str:
 @functools.cache
 def _packed_scripts(dim: int) -> str:
     """The scripts, compressed, in base64: a fourth of their size, so that notebooks stay small."""
-    names = ("player.js", "flat.js") if dim == 2 else ("three/three.min.js", "player.js", "solid.js")
+    names = ("player.js", "graph.js", *(("flat.js",) if dim == 2 else ("three/three.min.js", "solid.js")))
     licence = "" if dim == 2 else f"/* three.js:\n{_file('three/LICENSE-three')}*/\n"
     text = licence + "\n".join(map(_file, names))
     return base64.b64encode(zlib.compress(text.encode(), 9)).decode()

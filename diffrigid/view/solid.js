@@ -129,7 +129,9 @@ function makeView(canvas, scene, redraw) {
   function fill({ stage, runs }) {
     const parts = runs.map((run, r) => {
       const colour = (body) => () => scene.of(run, body), moving = run.bodies.length;
-      const shapes = run.shapes.filter((shape) => r === 0 || shape.body < moving).map((shape) => {
+      const owned = new Set(run.shapes.map((shape) => shape.body));
+      const bare = [...run.bodies.keys()].filter((body) => !owned.has(body)).map((body) => ({ body, kind: "ball", at: [0, 0, 0], radius: 0.012 * size }));
+      const shapes = [...run.shapes, ...bare].filter((shape) => r === 0 || shape.body < moving).map((shape) => {
         const made = shape.kind === "plane" ? plane(shape) : solid(shape, shape.body < moving ? colour(shape.body) : "ground", 1);
         return { body: shape.body, made };
       });
