@@ -193,29 +193,47 @@ def _meeting(at, h: np.ndarray, flying: np.ndarray) -> np.ndarray:
 
 def _repeated(point: np.ndarray, near: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Candidates (M, C) that lie where an earlier one of the same pair does."""
-    apart = np.linalg.norm(point[:, :, None] - point[:, None], axis=3)
-    earlier = np.tril(np.ones(2 * (near.shape[1],), bool), -1)
-    return ((apart < distance[:, None, None]) & near[:, None] & earlier).any(2)
+    repeated, several = np.zeros_like(near), np.flatnonzero(near.sum(1) > 1)
+    for row in several:
+        chosen = np.flatnonzero(near[row])
+        places = point[row, chosen]
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+        repeated[row, chosen] = np.tril(apart < distance[row], -1).any(1)
+    return repeated
 
 
 def _impulses(world: World, motion: Motion, touch: Touch, dp: np.ndarray, dL: np.ndarray) -> np.ndarray:
     """Impulses (M, D) [N s] on collider a (b receives the opposite), the least that explain the changes of momentum."""
-    found = np.zeros_like(touch.point)
-    order = np.argsort(touch.interval, kind="stable")
+    found, moving = np.zeros_like(touch.point), len(world.names)
+    change, order = np.concatenate([dp, dL], axis=2), np.argsort(touch.interval, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(touch.interval[order])) + 1):
         k, s = touch.interval[rows[0]], touch.s[rows]
         ends = np.stack([touch.a[rows], touch.b[rows]])
-        centre = motion.x[k][ends] + s[:, None] * motion.v[k][ends]
-        columns = _columns(ends, touch.point[rows] - centre, len(world.names), motion.w.shape[2])
-        joints = [_joint_columns(world, motion, k, group) for group in world.joints]
-        columns = np.concatenate([columns, *joints], axis=1)
-        target = np.concatenate([dp[k], dL[k]], axis=1).ravel()
-        used = np.abs(columns).max(1) > 0
-        A, y = columns[used], target[used]
-        normal = A @ A.T
-        lam = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), y)
-        found[rows] = (A.T @ lam)[: rows.size * dp.shape[2]].reshape(rows.size, -1)
+        arms = touch.point[rows] - motion.x[k][ends] - s[:, None] * motion.v[k][ends]
+        joints = [_anchors(world, motion, k, group) for group in world.joints]
+        all_ends, all_arms = (np.concatenate(parts, axis=1) for parts in zip((ends, arms), *joints, strict=True))
+        label = _islands(all_ends, moving)
+        island = label[all_ends.min(0)]  # statics have the larger numbers
+        for number in np.unique(island[: rows.size]):
+            bodies, chosen = np.flatnonzero(label == number), np.flatnonzero(island == number)
+            within = np.searchsorted(bodies, all_ends[:, chosen])
+            within = np.where(all_ends[:, chosen] < moving, within, len(bodies))
+            A = _columns(within, all_arms[:, chosen], len(bodies), motion.w.shape[2])
+            normal = A @ A.T
+            lam = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), change[k, bodies].ravel())
+            contacts = chosen[chosen < rows.size]
+            found[rows[contacts]] = (A.T @ lam).reshape(len(chosen), -1)[: len(contacts)]
     return found
+
+
+def _islands(ends: np.ndarray, moving: int) -> np.ndarray:
+    """For each of the moving bodies the least number of those it hangs together with, through `ends` (2, C)."""
+    label, (a, b) = np.arange(moving), ends[:, (ends < moving).all(0)]
+    while (label[a] != label[b]).any():
+        least = np.minimum(label[a], label[b])
+        np.minimum.at(label, a, least)
+        np.minimum.at(label, b, least)
+    return label
 
 
 def _columns(ends: np.ndarray, arms: np.ndarray, moving: int, A: int) -> np.ndarray:
@@ -236,11 +254,10 @@ def _moments(r: np.ndarray) -> np.ndarray:
     return np.array([[-r[1], r[0]]]) if len(r) == 2 else np.cross(r, np.eye(3)).T
 
 
-def _joint_columns(world: World, motion: Motion, k: int, group: Any) -> np.ndarray:
-    """Columns of the joints of one kind: impulses at their anchors."""
+def _anchors(world: World, motion: Motion, k: int, group: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Bodies (2, J) of the joints of one kind, and arms (2, J, D) [m] from their centres to the anchors."""
     a, anchor = np.array(group.a), np.asarray(group.anchor_a, float)
     arm_a = rotated(motion.q[k, a], anchor)
     b = np.array([len(world.names) + len(world.static_names) if end is None else end for end in group.b])
     x = np.concatenate([motion.x[k], np.zeros((1, world.dim))])
-    arms = np.stack([arm_a, motion.x[k, a] + arm_a - x[b]])
-    return _columns(np.stack([a, b]), arms, len(world.names), motion.w.shape[2])
+    return np.stack([a, b]), np.stack([arm_a, motion.x[k, a] + arm_a - x[b]])
