@@ -22,6 +22,7 @@ from diffrigid.state import (
 )
 from diffrigid.step import Trajectory, rollout, step
 from diffrigid.sysid import Fit, fit, interval, positive, real
+from diffrigid.view import Player, play
 from diffrigid.world import World, check
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "Gravity",
     "HalfSpace",
     "Hull",
+    "Player",
     "Polygon",
     "Prismatic",
     "Revolute",
@@ -58,6 +60,7 @@ __all__ = [
     "material_point",
     "material_velocity",
     "momentum",
+    "play",
     "positive",
     "real",
     "replace",

@@ -27,6 +27,15 @@ class Trajectory:
     state: State
     world: World
 
+    def _repr_html_(self) -> str | None:
+        """The motion itself, in a notebook; a batch is shown as text."""
+        from diffrigid.view import play  # the one import that points down, so that a result draws itself
+
+        try:
+            return play(self)._repr_html_()
+        except ValueError:
+            return None
+
 
 def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
     """State after dt [s].
