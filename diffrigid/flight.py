@@ -17,7 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from diffrigid.forces import is_constant, total_wrench
 from diffrigid.linkage import joint_wrench
@@ -48,19 +48,19 @@ class Flight:
 
 def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Flight:
     """Free motion of all bodies from `state`, each at its own time t0 (N, *batch), to t1 (*batch) [s]."""
-    bodies = world.bodies
+    bodies, varies = world.bodies, not is_constant(world.forces) or bool(world.joints)
     so = rotations(bodies.dim)
-    wrench = _wrench(world, state, controls)
     inverse = jax.vmap(so.inverse_inertia)(bodies.inertia)
     L = spin(bodies, state)
+    wrench = Wrench(F=jnp.zeros_like(state.v), tau=None) if varies else _wrench(world, state, controls)
     flight = Flight(
         t0=t0, x=state.x, q=state.q, v=state.v, L=L, a=wrench.F / bodies.mass[:, None], tau=wrench.tau,
         turn=jax.vmap(so.turn_series)(inverse, state.q, L, wrench.tau), inverse_mass=1.0 / bodies.mass,
         inverse_inertia=inverse, dim=bodies.dim,
     )  # fmt: skip
-    if is_constant(world.forces) and not world.joints:
+    if not varies:
         return flight
-    return _through_end(flight, _runge_kutta(world, flight, controls, t1[None] - t0), t1[None] - t0)
+    return _along(flight, *_runge_kutta(world, flight, controls, t1[None] - t0), t1[None] - t0, _has_torque(world))
 
 
 def _wrench(world: Any, state: State, controls: Any) -> Wrench:
@@ -79,8 +79,15 @@ class Motion:
     L: Array = array("N", "A")
 
 
-def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion, Motion]:
-    """The motion after T (N, *batch) [s], and its rates then, of which those of v and L are not at hand but 0."""
+def _has_torque(world: Any) -> bool:
+    return bool(world.joints) or any(getattr(force, "twists", True) for force in world.forces)
+
+
+def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion, Motion, Motion]:
+    """Rates at the anchor, the motion after T (N, *batch) [s], and its rates then.
+
+    Those of v and L at the end are not at hand but 0. The four stages are a loop, so that forces are compiled once.
+    """
     so = rotations(f.dim)
 
     def placed(motion):
@@ -102,24 +109,26 @@ def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion
     def after(rate, share):
         return jax.tree.map(lambda y, k: y + share * T[:, None] * k, start, rate)
 
+    def stage(rate, share):
+        rate = rates(after(rate, share))
+        return rate, rate
+
     start = Motion(x=f.x, phi=jnp.zeros_like(f.L), v=f.v, L=f.L)
-    tau = jnp.zeros_like(f.L) if f.tau is None else f.tau
-    first = Motion(x=f.v, phi=f.turn[:, 0], v=f.a, L=tau)
-    second = rates(after(first, 0.5))
-    third = rates(after(second, 0.5))
-    fourth = rates(after(third, 1.0))
-    mean = jax.tree.map(lambda a, b, c, d: (a + 2.0 * (b + c) + d) / 6.0, first, second, third, fourth)
-    end = after(mean, 1.0)
-    still = jnp.zeros_like
-    return end, Motion(x=end.v, phi=turning(end, placed(end)), v=still(end.v), L=still(end.L))
+    still = jax.tree.map(jnp.zeros_like, start)
+    _, k = lax.scan(stage, still, jnp.array([0.0, 0.5, 0.5, 1.0], f.x.dtype))
+    end = after(jax.tree.map(lambda k: (k[0] + 2.0 * (k[1] + k[2]) + k[3]) / 6.0, k), 1.0)
+    first = jax.tree.map(lambda k: k[0], k)
+    return first, end, replace(still, x=end.v, phi=turning(end, placed(end)))
 
 
-def _through_end(f: Flight, end: tuple[Motion, Motion], T: Array) -> Flight:
-    """The flight with the curves that end at `end`; where T is 0 they are straight."""
-    (motion, rate), T = end, T[:, None]
+def _along(f: Flight, begin: Motion, motion: Motion, rate: Motion, T: Array, has_torque: bool) -> Flight:
+    """The flight on the curves that begin with some rates and end with a motion; where T is 0 they are straight."""
+    T, f = T[:, None], replace(f, a=begin.v)
     jerk = safe_divide(6.0 * (motion.x - f.x - T * (f.v + 0.5 * T * f.a)), T**3)
     jolt = safe_divide(2.0 * (motion.v - f.v - T * f.a), T**2)
-    first = f.turn[:, 0]
+    if not has_torque:  # then L is kept, and the series is better
+        return replace(f, jerk=jerk, jolt=jolt)
+    first = begin.phi
     turn = jnp.stack(
         [
             first,
@@ -128,10 +137,8 @@ def _through_end(f: Flight, end: tuple[Motion, Motion], T: Array) -> Flight:
         ],
         axis=1,
     )
-    if f.tau is None:  # then L is kept, and the series is better
-        return replace(f, jerk=jerk, jolt=jolt)
-    twist = safe_divide(2.0 * (motion.L - f.L - T * f.tau), T**2)
-    return replace(f, jerk=jerk, jolt=jolt, twist=twist, turn=turn)
+    twist = safe_divide(2.0 * (motion.L - f.L - T * begin.L), T**2)
+    return replace(f, jerk=jerk, jolt=jolt, tau=begin.L, twist=twist, turn=turn)
 
 
 def position(f: Flight, s: Array) -> Array:
