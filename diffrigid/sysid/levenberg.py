@@ -1,9 +1,13 @@
-"""Levenberg-Marquardt on a batch of starts at once, with Jacobians by forward mode.
+"""Levenberg-Marquardt on a batch of starts at once, for numbers that all records share and those of each record.
 
-Source: Levenberg 1944, Marquardt 1963; damping as in Nielsen, IMM-REP-1999-05.
+The normal equations have the shape of an arrow: blocks A of the shared numbers, D_r of those of record r, and B_r
+between both. Those of the records are eliminated (Schur's complement), so that a thousand records cost a thousand small
+solves and one more.
+
+Source: Levenberg 1944, Marquardt 1963; Triggs et al., Bundle Adjustment, 2000, for the arrow.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,88 +16,165 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from diffrigid.sysid.problem import Group, linearise
+
+STIFF = 1e7  # a damping at which no step is taken any more
+SMALL = 1e-6  # a decrease still to be had, relative to the cost of one residual, that is nothing
+
+
+class Numbers(NamedTuple):
+    """z of a number of starts S."""
+
+    shared: Array  # (a, S)
+    own: Array  # (b, R, S)
+
+    def of(self, members: Sequence[int]) -> Array:
+        """All numbers of some records, (a + b, R of them, S)."""
+        own = self.own[:, jnp.asarray(members)]
+        shared = jnp.broadcast_to(self.shared[:, None], (self.shared.shape[0], *own.shape[1:]))
+        return jnp.concatenate([shared, own])
+
+
+class Point(NamedTuple):
+    """Residuals and Jacobians at z, one of each for every group."""
+
+    z: Numbers
+    residuals: tuple[Array, ...]  # (m, R, S)
+    jacobians: tuple[Array, ...]  # (m, a + b, R, S)
+
+
+class Arrow(NamedTuple):
+    """Normal equations of S starts."""
+
+    A: Array  # (S, a, a)
+    B: Array  # (S, R, a, b)
+    D: Array  # (S, R, b, b)
+    g: Array  # (S, a)
+    h: Array  # (S, R, b)
+
 
 class Progress(NamedTuple):
-    """S starts of n parameters after some iterations."""
+    """Where the starts are after some iterations."""
 
-    z: Array  # (n, S)
-    residuals: Array  # (m, S)
-    jacobian: Array  # (m, n, S)
+    point: Point
+    cost: Array  # (S)
     damping: Array  # (S)
-    step: Array  # (S) relative decrease of the cost at the last accepted step
+    done: Array  # (S) bool: nothing more to gain
 
 
-@jax.jit
-def cost(progress: Progress) -> Array:
-    """Half the sum of squares, (S)."""
-    return 0.5 * (progress.residuals**2).sum(0)
+def point_at(groups: Sequence[Group], z: Numbers) -> Point:
+    """Residuals and Jacobians of all groups."""
+    pairs = [linearise(group.plan, z.of(group.members), group.data) for group in groups]
+    return Point(z, tuple(r for r, _ in pairs), tuple(j for _, j in pairs))
 
 
-@partial(jax.jit, static_argnames="residuals", compiler_options={"xla_cpu_use_fusion_emitters": False})
-def linearise(residuals: Callable, z: Array, data: Any) -> tuple[Array, Array]:
-    """Residuals (m, S) and Jacobian (m, n, S) of `residuals(z, data)`, a column of each start at a time."""
-    units = jnp.eye(z.shape[0], dtype=z.dtype)[:, :, None] * jnp.ones_like(z)[None]
-    value, columns = jax.vmap(lambda unit: jax.jvp(lambda z: residuals(z, data), (z,), (unit,)), out_axes=(None, 1))(
-        units
-    )
-    return value, columns
+@partial(jax.jit, static_argnames="loss")
+def cost_of(loss: Any, residuals: tuple[Array, ...]) -> Array:
+    """Sum of the loss over all residuals, (S); inf where one is not finite."""
+    total = sum(loss.rho(r).sum((0, 1)) for r in residuals)
+    return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
 
-@jax.jit
-def begin(z: Array, residuals: Array, jacobian: Array) -> Progress:
-    """Progress before the first iteration."""
-    residuals = jnp.where(jnp.isfinite(residuals), residuals, jnp.inf)
-    damping = jnp.full(z.shape[1], 1e-2, z.dtype)
-    return Progress(z, residuals, jnp.nan_to_num(jacobian), damping, jnp.ones_like(damping))
+def arrow(loss: Any, point: Point, members: tuple[tuple[int, ...], ...]) -> Arrow:
+    """Normal equations at a point, each residual weighted as the loss asks."""
+    a, count = point.z.shared.shape[0], point.z.own.shape[1]
+    rows, pulls = [], []
+    for r, jac in zip(point.residuals, point.jacobians, strict=True):
+        ok = jnp.isfinite(jac).all((0, 1)) & jnp.isfinite(r).all(0)
+        r, jac = _choose(ok, r, jnp.zeros_like(r)), _choose(ok, jac, jnp.zeros_like(jac))
+        weighted = jac * loss.weight(r)[:, None]
+        rows.append(jnp.einsum("mirs,mjrs->srij", weighted, jac))
+        pulls.append(jnp.einsum("mirs,mrs->sri", weighted, r))
+    order = np.argsort(np.concatenate([np.asarray(m) for m in members]))
+    H, g = jnp.concatenate(rows, 1), jnp.concatenate(pulls, 1)
+    if not np.array_equal(order, np.arange(count)):
+        H, g = H[:, order], g[:, order]
+    return Arrow(H[..., :a, :a].sum(1), H[..., :a, a:], H[..., a:, a:], g[..., :a].sum(1), g[..., a:])
 
 
-@jax.jit
-def finished(progress: Progress) -> Array:
-    """True when every start has converged."""
-    return jnp.all((progress.step < 1e-10) | (progress.damping > 1e7))
+def eliminate(eq: Arrow) -> tuple[Array, Array, Array]:
+    """What is left for the shared numbers, (S, a, a) and (S, a), and D^-1 (B^T | h), (S, R, b, a + 1)."""
+    if eq.h.shape[-1] == 0:
+        return eq.A, eq.g, jnp.zeros((*eq.h.shape[:2], 0, eq.g.shape[-1] + 1), eq.g.dtype)
+    right = jnp.concatenate([jnp.swapaxes(eq.B, -1, -2), eq.h[..., None]], axis=-1)
+    solved = jnp.linalg.solve(eq.D, right)
+    taken = jnp.einsum("srab,srbc->sac", eq.B, solved)
+    return eq.A - taken[..., :-1], eq.g - taken[..., -1], solved
 
 
-@jax.jit
-def propose(progress: Progress) -> Array:
-    """Every start after its damped Gauss-Newton step, (n, S)."""
-    jac = jnp.moveaxis(progress.jacobian, -1, 0)  # (S, m, n)
-    normal = jnp.swapaxes(jac, 1, 2) @ jac
-    scale = jnp.maximum(jnp.diagonal(normal, axis1=1, axis2=2), 1e-12)
-    damped = (
-        normal + (progress.damping[:, None] * scale)[:, :, None] * jnp.eye(normal.shape[1], dtype=normal.dtype)[None]
-    )
-    gradient = (jac * progress.residuals.T[:, :, None]).sum(1)
-    step = -jnp.linalg.solve(damped, gradient[:, :, None])[:, :, 0].T
-    return progress.z + jnp.where(jnp.isfinite(step), step, 0.0)
+def solve(eq: Arrow) -> tuple[Array, Array]:
+    """The step that the normal equations ask for: of the shared numbers (S, a), and of each record's (S, R, b)."""
+    matrix, right, solved = eliminate(eq)
+    a = eq.g.shape[-1]
+    shared = -jnp.linalg.solve(matrix, right[..., None])[..., 0] if a else right
+    own = -solved[..., -1] - jnp.einsum("srba,sa->srb", solved[..., :-1], shared)
+    return shared, own
 
 
-@jax.jit
-def accept(progress: Progress, z: Array, residuals: Array, jacobian: Array) -> Progress:
-    """Per start: the new point if it costs less, else the old one with more damping."""
-    new = Progress(z, residuals, jacobian, progress.damping, progress.step)
-    old_cost, new_cost = cost(progress), cost(new)
-    finite = jnp.isfinite(new_cost) & jnp.isfinite(jacobian).all((0, 1))
-    better = finite & (new_cost < old_cost)
+def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
+    """With the diagonal enlarged, and shared numbers (a,) that are held left where they are."""
+    free = 1.0 - held
+    A = eq.A * (free[:, None] * free[None])[None] + jnp.diag(held)[None]
+    B = eq.B * free[None, None, :, None]
+
+    def enlarged(block: Array, damping: Array) -> Array:
+        scale = jnp.maximum(jnp.diagonal(block, axis1=-2, axis2=-1), 1e-12)
+        unit = jnp.eye(block.shape[-1], dtype=block.dtype).reshape((1,) * (block.ndim - 2) + block.shape[-2:])
+        return block + (damping * scale)[..., None] * unit
+
+    A, D = enlarged(A, damping[:, None]), enlarged(eq.D, damping[:, None, None])
+    return Arrow(A, B, D, eq.g * free[None], eq.h)
+
+
+@partial(jax.jit, static_argnames=("loss", "members"))
+def update(
+    loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, held: Array
+) -> tuple[Progress, Numbers]:
+    """Per start, the trial if it costs less, else the old point with more damping; and what to try next."""
+    new_cost = cost_of(loss, trial.residuals)
+    better = new_cost < progress.cost
+    point = jax.tree.map(lambda old, new: _choose(better, new, old), progress.point, trial)
+    cost = jnp.where(better, new_cost, progress.cost)
     damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), 1e-9, 1e9)
-    gain = jnp.where(better, (old_cost - new_cost) / jnp.maximum(old_cost, jnp.finfo(z.dtype).tiny), progress.step)
-    z, residuals, jacobian = (jnp.where(better, b, a) for a, b in zip(progress[:3], new[:3], strict=True))
-    return Progress(z, residuals, jacobian, damping, gain)
+    eq = damped(arrow(loss, point, members), damping, held)
+    shared, own = solve(eq)
+    gain = -0.5 * ((eq.g * shared).sum(-1) + (eq.h * own).sum((-1, -2)))
+    rows = sum(r.shape[0] * r.shape[1] for r in point.residuals)
+    done = (gain < SMALL * cost / rows) | (damping > STIFF) | ~jnp.isfinite(cost)
+    shared, own = (jnp.where(jnp.isfinite(step), step, 0.0) for step in (shared.T, jnp.moveaxis(own, 0, -1)))
+    z = Numbers(point.z.shared + shared, point.z.own + jnp.swapaxes(own, 0, 1))
+    return Progress(point, cost, damping, done), z
 
 
-def least_squares(
-    residuals: Callable, z: np.ndarray, data: Any, iterations: int, report: Callable[[int, Progress], None]
-) -> Progress:
-    """Minimise half the sum of squares of `residuals(z, data)` (m, S) from the starts z (n, S).
+def _choose(better: Array, new: Array, old: Array) -> Array:
+    """By start, the last axis."""
+    return jnp.where(better.reshape((1,) * (new.ndim - better.ndim) + better.shape), new, old)
 
-    Starts whose residuals are not finite stay where they are, at infinite cost. Stops when every start has
-    converged, its last step gaining less than 1e-10 of its cost or its damping at the limit.
+
+def levenberg(
+    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int, held: np.ndarray,
+    report: Callable[[int, np.ndarray], None],
+) -> tuple[Point, bool]:  # fmt: skip
+    """The lowest points found from the starts z, and whether the user interrupted.
+
+    Starts whose residuals are not finite stay where they are, at infinite cost. Ends when no start has anything to
+    gain any more.
+
+    Args:
+        held: (a,) bool: shared numbers that do not move.
     """
-    start = jnp.asarray(z)
-    progress = begin(start, *linearise(residuals, start, data))
-    for count in range(iterations):
-        report(count, progress)
-        trial = propose(progress)
-        progress = accept(progress, trial, *linearise(residuals, trial, data))
-        if bool(finished(progress)):
-            break
-    return progress
+    members = tuple(group.members for group in groups)
+    fixed = jnp.asarray(held, z.shared.dtype)
+    trial = point_at(groups, z)
+    starts = jnp.zeros_like(z.own, shape=z.own.shape[-1:])
+    progress = Progress(trial, starts + jnp.inf, starts + 5e-2, starts > 0)
+    try:
+        for count in range(iterations + 1):
+            progress, z = update(loss, members, progress, trial, fixed)
+            report(count, np.asarray(progress.cost))
+            if count == iterations or bool(progress.done.all()):
+                break
+            trial = point_at(groups, z)
+    except KeyboardInterrupt:
+        return progress.point, True
+    return progress.point, False

@@ -1,0 +1,308 @@
+"""The result of a fit: numbers with intervals, what is known of them, and what can be asked of it."""
+
+import json
+import platform
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid.paths import unit
+from diffrigid.state import State
+from diffrigid.step import Trajectory, rollout
+from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
+from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
+from diffrigid.sysid.free import Free
+from diffrigid.sysid.problem import Scene, Slot, knows, reference
+from diffrigid.sysid.setup import Problem, scene_of
+from diffrigid.sysid.table import html_table, text_table
+from diffrigid.world import World
+
+CLOSE = 0.95  # [-] a correlation from which two parameters are reported to move together
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One fitted number, or vector; with `records` > 0 that of each record, along a first axis."""
+
+    name: str
+    value: np.ndarray
+    low: np.ndarray  # 95 % interval
+    high: np.ndarray
+    unit: str
+    note: str  # "" or why not to trust it
+    records: int = 0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What can be written to a file of a fit."""
+
+    parameters: tuple[Parameter, ...]
+    noise: dict[str, float]  # standard deviation of each column's residuals, in its unit
+    costs: np.ndarray  # (starts,) the loss of the residuals, lowest first; inf: diverged
+    agree: int  # starts that ended at the best cost
+    notes: tuple[str, ...]  # what the data cannot tell, and why not to believe the intervals
+    seed: int
+    seconds: float
+    versions: dict[str, str]
+
+    def __getitem__(self, name: str) -> Parameter:
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise KeyError(f"no parameter {name!r}; there are {[p.name for p in self.parameters]}")
+
+    def __repr__(self) -> str:
+        return text_table(self)
+
+    def _repr_html_(self) -> str:
+        return html_table(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Write a JSON file, which `load_fit` reads."""
+        data = asdict(self)
+        for parameter in data["parameters"]:
+            parameter |= {key: parameter[key].tolist() for key in ("value", "low", "high")}
+        data["costs"] = self.costs.tolist()
+        Path(path).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        return Path(path)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of `fit`."""
+
+    summary: Summary
+    problem: Problem
+    scenes: tuple[Scene, ...]  # of every record, with the parameters put in
+    shared: np.ndarray  # (a,) z of the shared numbers
+    own: np.ndarray  # (b, R) z of those of each record
+    linear: Linear
+    uncertainty: Uncertainty  # of the shared numbers z
+    residuals: tuple[dict[str, np.ndarray], ...]  # of each record by column, (K, size), in standard deviations
+    starts: np.ndarray  # (a, starts) z of the shared numbers where every start ended, as `order` has them
+    loss: Any
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.summary.parameters
+
+    @property
+    def noise(self) -> dict[str, float]:
+        return self.summary.noise
+
+    @property
+    def costs(self) -> np.ndarray:
+        return self.summary.costs
+
+    @property
+    def agree(self) -> int:
+        return self.summary.agree
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.summary.notes
+
+    @property
+    def world(self) -> World:
+        """Of the first record."""
+        return self.scenes[0].world
+
+    @property
+    def state(self) -> State:
+        """Initial state of the first record."""
+        return self.scenes[0].state
+
+    @property
+    def t(self) -> np.ndarray:
+        """(T+1,) [s] times of the first record, from its start on."""
+        run = self.problem.runs[0]
+        return np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the shared unbounded numbers z, (a, a)."""
+        return self.uncertainty.covariance
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Of the shared numbers, (a, a)."""
+        return correlations(self.uncertainty.covariance)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The fitted motion of the first record at its measured times."""
+        return self.predict()
+
+    def predict(self, times: Any = None, record: int = 0, dt: float | None = None) -> Trajectory:
+        """Fitted motion of a record from its start on.
+
+        Args:
+            times: [s] increasing, the first at or after the start of the record; default its measured times.
+            dt: [s] longest step; default the longest interval between the measured times.
+        """
+        scene, run = self.scenes[record], self.problem.runs[record]
+        measured = np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
+        wanted = measured if times is None else np.asarray(times, float)
+        later = wanted if wanted[0] <= run.start else np.concatenate([[run.start], wanted])
+        longest = float(np.diff(measured).max()) if dt is None else dt
+        motion = rollout(scene.world, scene.state, dt=longest, times=later)
+        extra = len(later) - len(wanted)
+        state = jax.tree.map(lambda leaf: leaf[extra:], motion.state) if extra else motion.state
+        return Trajectory(t=motion.t[extra:], state=state, world=motion.world)
+
+    def with_intervals(self, intervals: Intervals) -> "Fit":
+        """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
+        uncertainty = intervals(self.linear)
+        parameters, notes = describe(
+            self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.scenes
+        )
+        summary = replace(self.summary, parameters=parameters, notes=notes)
+        return replace(self, summary=summary, uncertainty=uncertainty)
+
+    def save(self, path: str | Path) -> Path:
+        """Write what is in the table, with versions and seed, as JSON."""
+        return self.summary.save(path)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self.summary[name]
+
+    def __repr__(self) -> str:
+        return text_table(self.summary)
+
+    def _repr_html_(self) -> str:
+        return html_table(self.summary)
+
+
+def load_fit(path: str | Path) -> Summary:
+    """What `save` wrote: the table, and with `fit(..., resume=...)` where to go on from."""
+    data = json.loads(Path(path).read_text(encoding="utf-8"))
+    try:
+        parameters = tuple(
+            Parameter(**{**p, **{key: np.asarray(p[key], float) for key in ("value", "low", "high")}})
+            for p in data.pop("parameters")
+        )
+        return Summary(
+            parameters=parameters, costs=np.asarray(data.pop("costs"), float), notes=tuple(data.pop("notes")), **data
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a saved fit: {error}") from error
+
+
+def versions() -> dict[str, str]:
+    """Of what a result depends on."""
+    names = {"diffrigid": version("diffrigid"), "jax": jax.__version__, "numpy": np.__version__}
+    return names | {"python": platform.python_version(), "dtype": str(jnp.result_type(float))}
+
+
+# ---- intervals and notes
+
+
+def describe(
+    problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
+    residuals: tuple[dict[str, np.ndarray], ...], scenes: tuple[Scene, ...],
+) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
+    """The parameters with intervals, and the notes under the table."""
+    places = coordinates((*problem.shared, *problem.own), _references(problem))
+    blind = blind_directions(linear, places)
+    quantile = student_quantile(uncertainty.freedom)
+    covariance = infinite_where_blind(uncertainty.covariance, blind, linear.shared)
+    parameters = [
+        _shared_parameter(problem, slot, z, block, quantile, blind)
+        for slot, z, block in _pieces(problem.shared, shared, covariance)
+    ]
+    if problem.own:
+        blocks = [own_covariance(linear, k, uncertainty.covariance) for k in range(len(problem.runs))]
+        parameters += _own_parameters(problem, own, blocks, quantile, blind)
+    notes = [b.words for b in blind]
+    notes += weak(covariance, places[: linear.shared])
+    notes += _together(uncertainty.covariance, places[: linear.shared], blind)
+    series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]
+    given = all(name in run.noise for run in problem.runs for name in run.channels)
+    lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
+    count = sum(map(len, linear.rows))
+    notes += doubts(series, max(1.0 - lost / count, 0.05) if given else None)
+    return tuple(parameters), tuple(notes)
+
+
+def _references(problem: Problem) -> list[np.ndarray]:
+    scenes = [scene_of(run) for run in problem.runs]
+    return [
+        np.asarray(reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths))))
+        for slot in (*problem.shared, *problem.own)
+    ]
+
+
+def _pieces(slots: tuple[Slot, ...], z: np.ndarray, covariance: np.ndarray):
+    first = 0
+    for slot in slots:
+        rows = slice(first, first + slot.size)
+        yield slot, z[rows], covariance[rows, rows]
+        first += slot.size
+
+
+def _shared_parameter(problem: Problem, slot: Slot, z, covariance, quantile: float, blind) -> Parameter:
+    scenes = (scene_of(run) for run in problem.runs)
+    about = reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths)))
+    value, low, high = interval_of(slot, z, covariance, about, quantile)
+    note = "at its bound" if slot.kind.at_bound(value) else ""
+    if any(slot.name in b.names for b in blind):
+        note = "not determined, see below"
+    return Parameter(slot.name, value, low, high, unit_of(slot), note)
+
+
+def _own_parameters(problem: Problem, own: np.ndarray, blocks: list[np.ndarray], quantile: float, blind):
+    records, first = len(problem.runs), 0
+    for slot in problem.own:
+        rows = slice(first, first + slot.size)
+        triples = [
+            interval_of(slot, own[rows, k], blocks[k][rows, rows], reference(slot, scene_of(run)), quantile)
+            for k, run in enumerate(problem.runs)
+        ]
+        value, low, high = (np.stack(parts) for parts in zip(*triples, strict=True))
+        note = "at its bound" if slot.kind.at_bound(value) else ""
+        if any(slot.name in b.names for b in blind):
+            note = "not determined, see below"
+        yield Parameter(slot.name, value, low, high, unit_of(slot), note, records)
+        first += slot.size
+
+
+def interval_of(slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, quantile: float):
+    """Value, low and high end: through the map of z where it acts number by number, else to first order."""
+    dtype = jnp.result_type(about)
+    deviation = np.sqrt(np.diag(covariance))
+    if isinstance(slot.kind, Free):
+        ends = (z, z - quantile * deviation, z + quantile * deviation)
+        return tuple(np.asarray(slot.kind.value(jnp.asarray(end, dtype), about), float) for end in ends)
+    centre = jnp.asarray(z, dtype)
+    value = np.asarray(slot.kind.value(centre, about), float)
+    slope = np.asarray(jax.jacfwd(slot.kind.value)(centre, about), float)
+    if not np.isfinite(covariance).all():
+        half = np.full(value.shape, np.inf)
+    else:
+        half = quantile * np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", slope, covariance, slope), 0.0))
+    return value, value - half, value + half
+
+
+def unit_of(slot: Slot) -> str:
+    """SI unit; that of a column's bias or of what it observes is the user's."""
+    return "s" if slot.paths[0].split(".")[-1] == "clock" else unit(slot.paths[0])
+
+
+def _together(covariance: np.ndarray, places, blind) -> list[str]:
+    """Pairs of shared numbers whose errors go together, beyond those that are not determined at all."""
+    rho, out = correlations(covariance), []
+    bad = {name for b in blind for name in b.names}
+    for i, first in enumerate(places):
+        for j in range(i):
+            if abs(rho[i, j]) > CLOSE and first.path not in bad and places[j].path not in bad:
+                out.append(
+                    (abs(rho[i, j]), f"{places[j].name} and {first.name} go together (correlation {rho[i, j]:.3f})")
+                )
+    return [text for _, text in sorted(out, reverse=True)[:3]]
