@@ -12,7 +12,7 @@ from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacob
 from diffrigid.sysid.free import Chart, Each, Free, Prior
 from diffrigid.sysid.levenberg import Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.problem import split
+from diffrigid.sysid.parameters import split
 from diffrigid.sysid.result import Fit, Summary, describe, versions
 from diffrigid.sysid.setup import (
     LEAST,
@@ -22,6 +22,7 @@ from diffrigid.sysid.setup import (
     linear_of,
     make_problem,
     make_starts,
+    reach_of,
     row_mask,
     with_noise,
 )
@@ -81,7 +82,7 @@ def fit(
     _check(starts=starts, iterations=iterations, widths=widths, windows=windows)
     problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
     solve = levenberg if solver is None else solver
-    z, held = make_starts(problem, starts, seed), np.zeros(problem.sizes[0], bool)
+    z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)
     stages = [(width, windows[0]) for width in widths] + [(widths[-1], window) for window in windows[1:]]
     estimate, stopped = bool(problem.noise), False
@@ -91,7 +92,7 @@ def fit(
         for again in range(2 if estimate and number == len(stages) - 1 else 1):
             noise_now = estimated_noise(problem, point, loss) if again else problem.noise
             problem = with_noise(problem, noise_now, window, width)
-            point, stopped = solve(problem.groups, z, loss, iterations, held, report)
+            point, stopped = solve(problem.groups, z, loss, iterations, reach, report)
             z = point.z
             if stopped:
                 break
@@ -217,7 +218,7 @@ def _refuse_blind(problem: Problem, linear: Linear) -> None:
         if not np.any(size > 0):
             raise ValueError(
                 f"free: nothing that was measured depends on {slot.name} at the best fit: "
-                "leave it out, or give a record with an impact that shows it"
+                "leave it out, or give a record that shows it: an impact for restitution, one that slips for friction"
             )
 
 

@@ -19,7 +19,7 @@ from jax import Array
 from diffrigid.sysid.problem import Group, linearise
 
 STIFF = 1e7  # a damping at which no step is taken any more
-SMALL = 1e-6  # a decrease still to be had, relative to the cost of one residual, that is nothing
+SMALL = 1e-9  # a decrease still to be had, relative to the cost of one residual, that is nothing
 
 
 class Numbers(NamedTuple):
@@ -128,7 +128,7 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
 
 @partial(jax.jit, static_argnames=("loss", "members"))
 def update(
-    loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, held: Array
+    loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
 ) -> tuple[Progress, Numbers]:
     """Per start, the trial if it costs less, else the old point with more damping; and what to try next."""
     new_cost = cost_of(loss, trial.residuals)
@@ -136,14 +136,14 @@ def update(
     point = jax.tree.map(lambda old, new: _choose(better, new, old), progress.point, trial)
     cost = jnp.where(better, new_cost, progress.cost)
     damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), 1e-9, 1e9)
-    eq = damped(arrow(loss, point, members), damping, held)
+    eq = damped(arrow(loss, point, members), damping, (reach.shared[:, 0] == 0).astype(cost.dtype))
     shared, own = solve(eq)
     gain = -0.5 * ((eq.g * shared).sum(-1) + (eq.h * own).sum((-1, -2)))
     rows = sum(r.shape[0] * r.shape[1] for r in point.residuals)
     done = (gain < SMALL * cost / rows) | (damping > STIFF) | ~jnp.isfinite(cost)
-    shared, own = (jnp.where(jnp.isfinite(step), step, 0.0) for step in (shared.T, jnp.moveaxis(own, 0, -1)))
-    z = Numbers(point.z.shared + shared, point.z.own + jnp.swapaxes(own, 0, 1))
-    return Progress(point, cost, damping, done), z
+    step = Numbers(shared.T, jnp.transpose(own, (2, 1, 0)))
+    step = jax.tree.map(lambda dz, most: jnp.clip(jnp.where(jnp.isfinite(dz), dz, 0.0), -most, most), step, reach)
+    return Progress(point, cost, damping, done), jax.tree.map(jnp.add, point.z, step)
 
 
 def _choose(better: Array, new: Array, old: Array) -> Array:
@@ -152,7 +152,7 @@ def _choose(better: Array, new: Array, old: Array) -> Array:
 
 
 def levenberg(
-    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int, held: np.ndarray,
+    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int, reach: Numbers,
     report: Callable[[int, np.ndarray], None],
 ) -> tuple[Point, bool]:  # fmt: skip
     """The lowest points found from the starts z, and whether the user interrupted.
@@ -161,16 +161,15 @@ def levenberg(
     gain any more.
 
     Args:
-        held: (a,) bool: shared numbers that do not move.
+        reach: the longest step of each number, (a, 1) and (b, 1, 1); a shared number of which it is 0 is held.
     """
     members = tuple(group.members for group in groups)
-    fixed = jnp.asarray(held, z.shared.dtype)
     trial = point_at(groups, z)
     starts = jnp.zeros_like(z.own, shape=z.own.shape[-1:])
     progress = Progress(trial, starts + jnp.inf, starts + 5e-2, starts > 0)
     try:
         for count in range(iterations + 1):
-            progress, z = update(loss, members, progress, trial, fixed)
+            progress, z = update(loss, members, progress, trial, reach)
             report(count, np.asarray(progress.cost))
             if count == iterations or bool(progress.done.all()):
                 break

@@ -76,11 +76,10 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
         own_world, own_state = record.world or world, record.state or state
         check(own_world, own_state)
         series, channels = columns(own_world, own_state, record.observations, observe, where)
-        given = {**(noise or {}), **(record.noise or {})}
-        if unknown := set(given) - {s.name for s in series}:
-            raise ValueError(
-                f"noise: no column {sorted(unknown)[0]!r} in {where}, there are {[s.name for s in series]}"
-            )
+        names = [s.name for s in series]
+        if unknown := set(record.noise or {}) - set(names):
+            raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
+        given = {name: sigma for name, sigma in (noise or {}).items() if name in names} | dict(record.noise or {})
         first = min(float(s.t[0]) for s in series)
         start = first if record.start is None else float(record.start)
         if start > first:
@@ -88,6 +87,9 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
                 f"{where}: start is {start:g} s, after the first measured time {first:g} s: make it earlier"
             )
         found.append(Run(own_world, own_state, channels, series, start, given))
+    everywhere = sorted({s.name for run in found for s in run.series})
+    if unknown := set(noise or {}) - set(everywhere):
+        raise ValueError(f"noise: no column {sorted(unknown)[0]!r} in observations, there are {everywhere}")
     _refuse_empty_columns(found)
     return found
 

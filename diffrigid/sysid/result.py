@@ -18,11 +18,13 @@ from diffrigid.step import Trajectory, rollout
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
 from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
 from diffrigid.sysid.free import Free
-from diffrigid.sysid.problem import Scene, Slot, knows, reference
-from diffrigid.sysid.setup import Problem, scene_of
+from diffrigid.sysid.levenberg import levenberg
+from diffrigid.sysid.parameters import Scene, Slot, knows, reference
+from diffrigid.sysid.setup import Problem, by_column, make_problem, make_starts, reach_of, scene_of, with_noise
 from diffrigid.sysid.table import html_table, text_table
 from diffrigid.world import World
 
+SCORED = 30  # iterations for the numbers of a record that was held out
 CLOSE = 0.95  # [-] a correlation from which two parameters are reported to move together
 
 
@@ -157,6 +159,26 @@ class Fit:
         state = jax.tree.map(lambda leaf: leaf[extra:], motion.state) if extra else motion.state
         return Trajectory(t=motion.t[extra:], state=state, world=motion.world)
 
+    def score(self, observations: Any) -> dict[str, float]:
+        """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
+
+        Numbers that every record has for itself are found anew; without such, a record starts from its own state, by
+        default that of the first record of the fit.
+        """
+        shared = replace(self.summary, parameters=tuple(p for p in self.parameters if not p.records))
+        free, observe = self.problem.free, self.problem.observe
+        problem = make_problem(self.world, self.state, observations, free=free, observe=observe, resume=shared)
+        problem = with_noise(problem, {name: self.noise.get(name, s) for name, s in problem.noise.items()})
+        z, reach = make_starts(problem, 1, 0), reach_of(problem, range(problem.sizes[0]))
+        iterations = SCORED if problem.own else 0
+        point, _ = levenberg(problem.groups, z, self.loss, iterations, reach, lambda count, costs: None)
+        found = by_column(problem, point, 0)
+        out = {}
+        for name, sigma in problem.noise.items():
+            values = np.concatenate([sigma * columns[name].ravel() for columns in found if name in columns])
+            out[name] = float(np.sqrt(np.nanmean(values**2)))
+        return out
+
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
         uncertainty = intervals(self.linear)
@@ -224,6 +246,7 @@ def describe(
     notes += weak(covariance, places[: linear.shared])
     notes += _together(uncertainty.covariance, places[: linear.shared], blind)
     series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]
+    series = [r for r in series if np.isfinite(r).any()]
     given = all(name in run.noise for run in problem.runs for name in run.channels)
     lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
     count = sum(map(len, linear.rows))

@@ -9,6 +9,7 @@ the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -134,15 +135,17 @@ def channel_of(name: str, what: Any, world: World, state: State) -> Channel:
         what: "ball.x", an observer, a Channel around one of them, or a function of the state.
     """
     channel = what if isinstance(what, Channel) else Channel(observer=what)
-    observer = _resolved(name, channel.observer, world)
-    sizes = {"D": world.dim, "Q": 2 if world.dim == 2 else 4, "H": 3, "P": 2, "M": size_of(observer, state)}
+    sizes = {"D": world.dim, "Q": 2 if world.dim == 2 else 4, "H": 3, "P": 2}
+    observer = map_arrays(partial(_fill, sizes), _resolved(name, channel.observer, world), name)
+    sizes["M"] = size_of(observer, state)
+    return map_arrays(partial(_fill, sizes), replace(channel, observer=observer), name)
 
-    def fill(leaf, letters, path):
-        axes = tuple(sizes[letter] for letter in letters)
-        value = np.asarray(numbers(path, leaf, None))
-        return numbers(path, np.broadcast_to(value, axes) if value.ndim == 0 else value, axes)
 
-    return map_arrays(fill, replace(channel, observer=observer), name)
+def _fill(sizes: dict[str, int], leaf: Any, letters: tuple[str, ...], path: str) -> Any:
+    """A leaf as an array with its axes; a number stands for all components."""
+    axes = tuple(sizes[letter] for letter in letters)
+    value = np.asarray(numbers(path, leaf, None))
+    return numbers(path, np.broadcast_to(value, axes) if value.ndim == 0 else value, axes)
 
 
 def size_of(observer: Any, state: State) -> int:

@@ -1,8 +1,8 @@
 """The problem that a fit solves, as data and plain functions for any other optimiser:
 
-    problem = make_problem(world, state, observations, free={"restitution": interval(0, 1)}, noise={"ball.x": 1e-3})
-    residuals, jacobian = partial(residual_vector, problem), partial(jacobian_matrix, problem)
-    scipy.optimize.least_squares(residuals, start_vector(problem), jacobian)
+problem = make_problem(world, state, observations, free={"restitution": interval(0, 1)}, noise={"ball.x": 1e-3})
+residuals, jacobian = partial(residual_vector, problem), partial(jacobian_matrix, problem)
+scipy.optimize.least_squares(residuals, start_vector(problem), jacobian)
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,22 +15,10 @@ import numpy as np
 from diffrigid.state import State
 from diffrigid.step import floats
 from diffrigid.sysid.covariance import Linear
+from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, Point
-from diffrigid.sysid.problem import (
-    Group,
-    Scene,
-    Slot,
-    circular,
-    evaluate,
-    known,
-    knows,
-    linearise,
-    make_groups,
-    make_slots,
-    put,
-    reference,
-    write,
-)
+from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
+from diffrigid.sysid.problem import Group, circular, evaluate, known, linearise, make_groups
 from diffrigid.sysid.records import Run, noise_guess, runs
 from diffrigid.world import World
 
@@ -46,6 +34,8 @@ class Problem:
     own: tuple[Slot, ...]
     groups: tuple[Group, ...]
     noise: dict[str, float]  # of columns whose noise is not given with their record
+    free: Mapping[Any, Any]  # as the user gave it
+    observe: Mapping[str, Any]  # likewise
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -72,7 +62,7 @@ def make_problem(
         found = _resumed(found, resume, free)
     shared, own = make_slots(free, [scene_of(run) for run in found])
     groups = make_groups(found, (*shared, *own), len(shared), dt)
-    problem = Problem(tuple(found), shared, own, tuple(groups), {})
+    problem = Problem(tuple(found), shared, own, tuple(groups), {}, dict(free), dict(observe or {}))
     return with_noise(problem, _noise_guesses(found))
 
 
@@ -169,6 +159,17 @@ def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
         own.append(np.concatenate(rows) if rows else first_own)
     dtype = problem.runs[0].state.x.dtype
     return Numbers(jnp.asarray(np.stack(shared, -1), dtype), jnp.asarray(np.stack(own, -1), dtype))
+
+
+def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
+    """The longest step of each number: a factor e^2 for one that z is the logarithm of, or the like; 0 if held."""
+    dtype = problem.runs[0].state.x.dtype
+    parts = []
+    for slots in (problem.shared, problem.own):
+        real = [isinstance(slot.kind, Free) and np.isinf(slot.kind.low) for slot in slots]
+        parts.append(_joined([np.full(slot.size, np.inf if r else 2.0) for slot, r in zip(slots, real, strict=True)]))
+    parts[0][list(held)] = 0.0
+    return Numbers(jnp.asarray(parts[0], dtype)[:, None], jnp.asarray(parts[1], dtype)[:, None, None])
 
 
 def _value(problem: Problem, slot: Slot) -> Any:
