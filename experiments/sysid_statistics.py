@@ -24,7 +24,7 @@ from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import squares
 from diffrigid.sysid.setup import first_numbers, linear_of, make_problem, make_starts
 
-MISSING, DRAG = 0.1, 0.08  # share of the numbers; [N s/m] that the fit does not know of
+MISSING = 0.1  # share of the numbers
 FLOOR = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
 
 
@@ -39,6 +39,7 @@ class Case:
     free: dict
     t: np.ndarray
     noise: dict
+    drag: float  # [N s/m] that a fit does not know of
 
 
 def ball(p, forces=()):
@@ -71,6 +72,7 @@ CASES = [
         {"restitution": dr.interval(0, 1), "ball.x": dr.real(), "ball.v": dr.real()},
         np.arange(91) / 60,
         {"ball.x": 3e-3},
+        0.08,
     ),
     Case(
         "three discs",
@@ -80,6 +82,7 @@ CASES = [
         {"restitution": dr.interval(0, 1), "b.mass": dr.positive(), "a.v": dr.real()},
         np.arange(120) / 60,
         {f"{name}.x": 3e-3 for name in "abc"},
+        0.08,
     ),
     Case(
         "tossed box with friction",
@@ -92,6 +95,7 @@ CASES = [
          "box.v": dr.real(), "box.angle": dr.real(), "box.w": dr.real()},
         np.arange(73) / 120,
         {"box.x": 1e-3, "box.angle": 5e-3},
+        0.3,
     ),
 ]  # fmt: skip
 
@@ -158,7 +162,7 @@ def efficiency(case, count):
 
 def misspecified(case, count):
     """Coverage of each kind of interval where the records have a drag, and how often the table warns."""
-    _, fits = fit_all(case, exact_columns(case, [dr.Drag(linear=DRAG)]), count, 2)
+    _, fits = fit_all(case, exact_columns(case, [dr.Drag(linear=case.drag)]), count, 2)
     kinds = {"jacobian": dr.sysid.from_jacobian, "sandwich": dr.sandwich, "bootstrap": dr.bootstrap}
     out = {name: float(np.mean([covered(f.with_intervals(kind), case) for f in fits])) for name, kind in kinds.items()}
     doubted = np.array([any("residuals" in note for note in fit.notes) for fit in fits])

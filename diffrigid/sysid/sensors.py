@@ -8,6 +8,7 @@ the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point
     COLUMN.clock    [s]      how far its clock is ahead: a time t of it is the time t - clock of the simulation
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -27,6 +28,11 @@ from diffrigid.world import World
 FIELDS = ("x", "v", "w", "q", "angle")
 
 
+def _first(metadata: dict[str, Any] | None = None) -> Any:
+    """Field that may be given by its place."""
+    return dataclasses.field(kw_only=False, metadata=metadata)
+
+
 @pytree
 class Part:
     """A field of a body's state: "ball.x", "ball.v", "ball.w", or "ball.angle" (2D) and "ball.q", up to full turns."""
@@ -44,7 +50,7 @@ class Part:
 class Marker:
     """World position of a point fixed to a body, (D,) [m]."""
 
-    body: Any = static()
+    body: Any = _first({"static": True})
     point: Leaf = array("D", default=0.0)  # (D, *batch) [m] body axes, from the centre of mass
 
     def __call__(self, state: State) -> Array:
@@ -55,8 +61,8 @@ class Marker:
 class Separation:
     """Distance between two observed points, (1,) [m]; each a Marker or the name of a body."""
 
-    a: Any
-    b: Any
+    a: Any = _first()
+    b: Any = _first()
 
     def __call__(self, state: State) -> Array:
         return norm(self.a(state) - self.b(state))[None]
@@ -66,7 +72,7 @@ class Separation:
 class Homography:
     """Pixels of a point of the plane in a camera that looks at it: (u, v) = (h0, h1) / h2, h = matrix (x, y, 1)."""
 
-    of: Any
+    of: Any = _first()
     matrix: Leaf = array("H", "H")  # (3, 3, *batch)
 
     def __call__(self, state: State) -> Array:
@@ -79,7 +85,7 @@ class Homography:
 class Pinhole:
     """Pixels of a point of space: (u, v) = focal (X, Y) / Z + center, in camera axes x right, y down, z forward."""
 
-    of: Any
+    of: Any = _first()
     x: Leaf = array("D")  # (3, *batch) [m] of the camera
     q: Leaf = array("Q")  # (4, *batch) camera axes to world
     focal: Leaf = array()  # (*batch) [pixel]
@@ -105,7 +111,7 @@ class Function:
 class Channel:
     """One column: what it observes, and its instrument."""
 
-    observer: Any
+    observer: Any = _first()
     bias: Leaf = array("M", default=0.0)  # (size, *batch) in the unit of the column
     scale: Leaf = array(default=1.0)  # (*batch) [-]
     clock: Leaf = array(default=0.0)  # (*batch) [s]
