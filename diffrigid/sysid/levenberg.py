@@ -57,9 +57,9 @@ class Progress(NamedTuple):
     """Where the starts are after some iterations."""
 
     point: Point
-    cost: Array  # (S)
-    damping: Array  # (S)
-    done: Array  # (S) bool: nothing more to gain
+    cost: Array  # (R, S)
+    damping: Array  # (R, S)
+    done: Array  # (R, S) bool: nothing more to gain
 
 
 def point_at(groups: Sequence[Group], z: Numbers) -> Point:
@@ -71,24 +71,26 @@ def point_at(groups: Sequence[Group], z: Numbers) -> Point:
 @partial(jax.jit, static_argnames="loss")
 def cost_of(loss: Any, residuals: tuple[Array, ...]) -> Array:
     """Sum of the loss over all residuals, (S); inf where one is not finite."""
-    total = sum(loss.rho(r).sum((0, 1)) for r in residuals)
+    return jnp.concatenate([_costs(loss, r) for r in residuals]).sum(0)
+
+
+def _costs(loss: Any, residuals: Array) -> Array:
+    """Of each record of a group, (R, S)."""
+    total = loss.rho(residuals).sum(0)
     return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
 
 def arrow(loss: Any, point: Point, members: tuple[tuple[int, ...], ...]) -> Arrow:
     """Normal equations at a point, each residual weighted as the loss asks."""
-    a, count = point.z.shared.shape[0], point.z.own.shape[1]
+    a = point.z.shared.shape[0]
     rows, pulls = [], []
     for r, jac in zip(point.residuals, point.jacobians, strict=True):
         ok = jnp.isfinite(jac).all((0, 1)) & jnp.isfinite(r).all(0)
         r, jac = _choose(ok, r, jnp.zeros_like(r)), _choose(ok, jac, jnp.zeros_like(jac))
         weighted = jac * loss.weight(r)[:, None]
-        rows.append(jnp.einsum("mirs,mjrs->srij", weighted, jac))
-        pulls.append(jnp.einsum("mirs,mrs->sri", weighted, r))
-    order = np.argsort(np.concatenate([np.asarray(m) for m in members]))
-    H, g = jnp.concatenate(rows, 1), jnp.concatenate(pulls, 1)
-    if not np.array_equal(order, np.arange(count)):
-        H, g = H[:, order], g[:, order]
+        rows.append(jnp.einsum("mirs,mjrs->rsij", weighted, jac))
+        pulls.append(jnp.einsum("mirs,mrs->rsi", weighted, r))
+    H, g = (jnp.swapaxes(_in_order(members, parts), 0, 1) for parts in (rows, pulls))
     return Arrow(H[..., :a, :a].sum(1), H[..., :a, a:], H[..., a:, a:], g[..., :a].sum(1), g[..., a:])
 
 
@@ -112,7 +114,7 @@ def solve(eq: Arrow) -> tuple[Array, Array]:
 
 
 def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
-    """With the diagonal enlarged, and shared numbers (a,) that are held left where they are."""
+    """With the diagonal enlarged by damping (S, R), and shared numbers (a,) that are held left where they are."""
     free = 1.0 - held
     A = eq.A * (free[:, None] * free[None])[None] + jnp.diag(held)[None]
     B = eq.B * free[None, None, :, None]
@@ -122,7 +124,7 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
         unit = jnp.eye(block.shape[-1], dtype=block.dtype).reshape((1,) * (block.ndim - 2) + block.shape[-2:])
         return block + (damping * scale)[..., None] * unit
 
-    A, D = enlarged(A, damping[:, None]), enlarged(eq.D, damping[:, None, None])
+    A, D = enlarged(A, damping.max(1)[:, None]), enlarged(eq.D, damping[:, :, None])
     return Arrow(A, B, D, eq.g * free[None], eq.h)
 
 
@@ -130,25 +132,47 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
 def update(
     loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
 ) -> tuple[Progress, Numbers]:
-    """Per start, the trial if it costs less, else the old point with more damping; and what to try next."""
-    new_cost = cost_of(loss, trial.residuals)
-    better = new_cost < progress.cost
-    point = jax.tree.map(lambda old, new: _choose(better, new, old), progress.point, trial)
+    """The trial where it costs less, else the old point with more damping; and what to try next.
+
+    A start is accepted or not as a whole; where nothing that is shared moves, each record for itself.
+    """
+    held = (reach.shared[:, 0] == 0).astype(progress.cost.dtype)
+    alone = held.all()
+    new_cost = _in_order(members, [_costs(loss, r) for r in trial.residuals])
+    whole = new_cost.sum(0) < progress.cost.sum(0)
+    better = jnp.where(alone, new_cost < progress.cost, whole[None])
+    point = _chosen(better, whole, trial, progress.point, members)
     cost = jnp.where(better, new_cost, progress.cost)
     damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), 1e-9, 1e9)
-    eq = damped(arrow(loss, point, members), damping, (reach.shared[:, 0] == 0).astype(cost.dtype))
+    eq = damped(arrow(loss, point, members), damping.T, held)
     shared, own = solve(eq)
-    gain = -0.5 * ((eq.g * shared).sum(-1) + (eq.h * own).sum((-1, -2)))
-    rows = sum(r.shape[0] * r.shape[1] for r in point.residuals)
-    done = (gain < SMALL * cost / rows) | (damping > STIFF) | ~jnp.isfinite(cost)
+    gain = -0.5 * (eq.h * own).sum(-1).T
+    gain = jnp.where(alone, gain, (gain.sum(0) - 0.5 * (eq.g * shared).sum(-1))[None])
+    level = jnp.where(alone, cost, cost.sum(0)[None]) / sum(len(r) for r in point.residuals)
+    done = (gain < SMALL * level) | (damping > STIFF) | ~jnp.isfinite(level)
     step = Numbers(shared.T, jnp.transpose(own, (2, 1, 0)))
     step = jax.tree.map(lambda dz, most: jnp.clip(jnp.where(jnp.isfinite(dz), dz, 0.0), -most, most), step, reach)
     return Progress(point, cost, damping, done), jax.tree.map(jnp.add, point.z, step)
 
 
+def _chosen(better: Array, whole: Array, new: Point, old: Point, members: tuple[tuple[int, ...], ...]) -> Point:
+    """New where better (R, S) by record; shared numbers where the whole start is, (S)."""
+    rows = [better[np.asarray(group)] for group in members]
+    z = Numbers(_choose(whole, new.z.shared, old.z.shared), _choose(better, new.z.own, old.z.own))
+    r = [_choose(ok, a, b) for ok, a, b in zip(rows, new.residuals, old.residuals, strict=True)]
+    jac = [_choose(ok, a, b) for ok, a, b in zip(rows, new.jacobians, old.jacobians, strict=True)]
+    return Point(z, tuple(r), tuple(jac))
+
+
 def _choose(better: Array, new: Array, old: Array) -> Array:
-    """By start, the last axis."""
+    """By the last axes."""
     return jnp.where(better.reshape((1,) * (new.ndim - better.ndim) + better.shape), new, old)
+
+
+def _in_order(members: tuple[tuple[int, ...], ...], parts: Sequence[Array]) -> Array:
+    """Rows of all groups in the order of the records."""
+    joined, order = jnp.concatenate(parts), np.argsort(np.concatenate([np.asarray(m) for m in members]))
+    return joined if np.array_equal(order, np.arange(len(order))) else joined[order]
 
 
 def levenberg(
@@ -165,12 +189,12 @@ def levenberg(
     """
     members = tuple(group.members for group in groups)
     trial = point_at(groups, z)
-    starts = jnp.zeros_like(z.own, shape=z.own.shape[-1:])
+    starts = jnp.zeros_like(z.own, shape=z.own.shape[1:])
     progress = Progress(trial, starts + jnp.inf, starts + 5e-2, starts > 0)
     try:
         for count in range(iterations + 1):
             progress, z = update(loss, members, progress, trial, reach)
-            report(count, np.asarray(progress.cost))
+            report(count, np.asarray(progress.cost.sum(0)))
             if count == iterations or bool(progress.done.all()):
                 break
             trial = point_at(groups, z)
