@@ -58,10 +58,10 @@ def main():
     print(f"all drops, {time.perf_counter() - began:.0f} s\n{fit}\n\nfrom how much each drop pulls")
     for p in fit.with_intervals(dr.sandwich).parameters[:4]:
         root = np.sqrt if p.name == "square.inertia" else np.asarray
-        print(f"{p.name:20} {root(p.value):.4g}  {root(np.maximum(p.low, 0)):.4g} .. {root(p.high):.4g}")
+        print(f"{p.name:20} {root(p.value):.4g}  {root(p.low):.4g} .. {root(p.high):.4g}")
     train, held = drops(record, state)[: args.train], drops(record, state)[args.train :]
     part = dr.fit(world, state, train, free=free, noise=NOISE, progress=False)
-    for label, found in (("fitted", part.score(train)), ("held out", part.score(held))):
+    for label, found in (("fitted", part.score(train, starts=8)), ("held out", part.score(held, starts=8))):
         x, angle = 1e3 * found["square.x"], np.degrees(found["square.angle"])
         print(f"{label:10} residuals {x:.2f} mm, {angle:.2f} degrees")
 

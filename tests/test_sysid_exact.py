@@ -197,6 +197,18 @@ def test_outliers_do_not_pull_with_a_robust_loss():
         assert found.noise["p.x"] < 0.01
 
 
+def test_intervals_of_a_robust_loss_are_those_of_an_m_estimator(exact, records):
+    """Covariance mean(psi^2) / mean(psi')^2 (X^T X)^-1, with psi = rho', for given noise."""
+    matrix, right, _, _ = exact
+    found = dr.fit(*point(), records, free=FREE, noise={"p.x": NOISE}, loss=dr.huber(1.0), progress=False)
+    z = np.concatenate([found["gravity"].value, np.hstack([found["p.x"].value, found["p.v"].value]).ravel()])
+    r = (matrix @ z - right) / NOISE
+    psi = np.clip(r, -1.0, 1.0)
+    assert_allclose(matrix.T @ psi, 0.0, atol=1e-3 * np.sqrt(len(r)))
+    factor = (psi**2).sum() / (len(r) - len(z)) / (np.abs(r) < 1.0).mean() ** 2 * NOISE**2
+    assert_allclose(found.covariance, factor * np.linalg.inv(matrix.T @ matrix)[:2, :2], rtol=1e-5, atol=1e-12)
+
+
 def test_a_prior_counts_as_one_more_measurement():
     """Precisions add: of the data, and of the prior."""
     data, noise = spring_record(), {"p.x": 2e-3}

@@ -231,6 +231,10 @@ def test_residuals_of_noise_are_believed_and_others_are_not():
     noise = [random.standard_normal(300) for _ in range(200)]
     chances = np.array([whiteness([r]) for r in noise])
     assert_allclose([(chances < p).mean() for p in (0.1, 0.5)], (0.1, 0.5), atol=0.08)  # uniform
+    line = np.polynomial.polynomial.polyvander(np.linspace(-1, 1, 25), 2)
+    basis = np.linalg.qr(line)[0]
+    short = [r[:25] - basis @ (basis.T @ r[:25]) for r in noise]  # what a fit of a parabola leaves
+    assert whiteness(short) > 0.5
     assert_allclose(np.mean([normality(r) < 0.1 for r in noise]), 0.1, atol=0.08)
     assert doubts(noise[:3], 1.0) == []
     drift = noise[0] + np.sin(np.arange(300) / 20)

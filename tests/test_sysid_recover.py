@@ -115,7 +115,9 @@ def test_a_ruler_with_a_wrong_scale_and_a_late_clock():
 
 def test_only_ratios_of_masses_and_stiffness_are_seen():
     free = {"a.mass": dr.positive(), "b.mass": dr.positive(), "spring.stiffness": dr.positive()}
+    before = dr.sysid.blind_spots(*pair(1.2, 1.2, 10.0), pair_record(), free=free)
     fit = dr.fit(*pair(1.2, 1.2, 10.0), pair_record(), free=free, progress=False)
+    assert before == fit.notes[:1]
     assert "only the ratios of a.mass, b.mass, spring.stiffness are seen" in repr(fit)
     assert np.isinf(fit["a.mass"].high) and "not determined" in fit["a.mass"].note
     ratios = [fit[name].value / fit["a.mass"].value for name in ("b.mass", "spring.stiffness")]

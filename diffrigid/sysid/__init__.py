@@ -1,7 +1,7 @@
 """System identification: from measured columns to parameters with intervals."""
 
 from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
-from diffrigid.sysid.design import best_launch, expected_intervals
+from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
 from diffrigid.sysid.figures import correlation_figure, cost_figure, profile_figure, residual_figure
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import Free, direction, each, inertia, interval, positive, prior, real, rotation, shares
@@ -25,6 +25,7 @@ __all__ = [
     "Record",
     "Separation",
     "best_launch",
+    "blind_spots",
     "bootstrap",
     "correlation_figure",
     "cost_figure",

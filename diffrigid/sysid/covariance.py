@@ -16,13 +16,17 @@ MANY = 1e6  # degrees of freedom: Student's distribution is the normal one
 
 @dataclass(frozen=True)
 class Linear:
-    """A fit about its best point: residuals in standard deviations and their derivatives, cluster by cluster."""
+    """A fit about its best point: residuals in standard deviations and their derivatives, record by record.
+
+    With a robust loss the residuals are rho'(r) over the mean of rho''(r): what least squares would have to see to move
+    as the fit does. Source: Huber and Ronchetti, Robust Statistics, 2009, section 7.6.
+    """
 
     rows: tuple[np.ndarray, ...]  # of each record, (m,) residuals, those missing left out
     slopes: tuple[np.ndarray, ...]  # of each record, (m, a + b)
     times: tuple[np.ndarray, ...]  # of each record, (m,) [s]; NaN for a prior
-    weights: tuple[np.ndarray, ...]  # of each record, (m,) of the loss
     shared: int  # a
+    variance: float  # of the residuals: 1, or what it is with a robust loss
     estimated: bool  # the noise comes from the residuals
 
 
@@ -41,7 +45,12 @@ def from_jacobian(linear: Linear) -> Uncertainty:
     """(J^T J)^-1: right where residuals are independent and the model holds. The usual one."""
     numbers = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
     freedom = max(sum(map(len, linear.rows)) - numbers, 1) if linear.estimated else MANY
-    return Uncertainty(inverse(np.sum(_blocks(linear)[0], axis=0)), float(freedom))
+    return Uncertainty(linear.variance * inverse(information(linear)), float(freedom))
+
+
+def information(linear: Linear) -> np.ndarray:
+    """J^T J of the shared numbers, (a, a), those of each record eliminated."""
+    return np.sum(_blocks(linear)[0], axis=0)
 
 
 def sandwich(linear: Linear) -> Uncertainty:
@@ -69,10 +78,10 @@ def bootstrap(linear: Linear) -> Uncertainty:
 
 def own_covariance(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
     """Covariance (b, b) of a record's own numbers, given that of the shared ones."""
-    a, J, w = linear.shared, linear.slopes[record], linear.weights[record]
-    D = J[:, a:].T @ (w[:, None] * J[:, a:])
-    across = inverse(D) @ (J[:, a:].T @ (w[:, None] * J[:, :a]))
-    return inverse(D) + across @ shared @ across.T
+    shared_part, own = np.split(linear.slopes[record], [linear.shared], axis=1)
+    D = inverse(own.T @ own)
+    across = D @ own.T @ shared_part
+    return linear.variance * D + across @ shared @ across.T
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
@@ -112,8 +121,7 @@ def _clusters(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 def eliminated(linear: Linear, record: int) -> tuple[np.ndarray, np.ndarray]:
     """Slopes by the shared numbers (m, a) and residuals of a record, freed of what its own numbers can explain."""
-    root = np.sqrt(linear.weights[record])
-    J, r = root[:, None] * linear.slopes[record], root * linear.rows[record]
+    J, r = linear.slopes[record], linear.rows[record]
     own = J[:, linear.shared :]
     if own.shape[1] == 0:
         return J, r

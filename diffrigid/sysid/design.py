@@ -9,9 +9,10 @@ import numpy as np
 
 from diffrigid.state import State
 from diffrigid.sysid.covariance import MANY, Linear, from_jacobian, inverse
+from diffrigid.sysid.diagnosis import blind_directions, coordinates
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.parameters import Slot, make_slots, put, reference
+from diffrigid.sysid.parameters import Slot, knows, make_slots, put, reference
 from diffrigid.sysid.records import Record
 from diffrigid.sysid.result import Parameter, interval_of, unit_of
 from diffrigid.sysid.setup import Problem, first_numbers, linear_of, make_problem, make_starts, scene_of
@@ -44,6 +45,20 @@ def expected_intervals(
     """
     problem = _problem(world, state, [state], planned, free, noise, observe, dt)
     return _parameters(problem, 0, _linears(problem)[0])
+
+
+def blind_spots(
+    world: World, state: State, observations: Any, *, free: Mapping[Any, Any], noise: Mapping[str, Any] | None = None,
+    observe: Mapping[str, Any] | None = None, dt: float | None = None,
+) -> tuple[str, ...]:  # fmt: skip
+    """What these observations cannot tell, in words, before any fit: at the values of the scene. Arguments of `fit`."""
+    problem = make_problem(world, state, observations, free=free, noise=noise, observe=observe, dt=dt)
+    linear = linear_of(problem, point_at(problem.groups, make_starts(problem, 1, 0)), 0, Squares(), False)
+    slots = (*problem.shared, *problem.own)
+    scenes = [scene_of(run) for run in problem.runs]
+    having = [next(s for s in scenes if all(knows(s, path) for path in slot.paths)) for slot in slots]
+    places = coordinates(slots, [np.asarray(reference(*pair)) for pair in zip(slots, having, strict=True)])
+    return tuple(blind.words for blind in blind_directions(linear, places))
 
 
 def best_launch(
@@ -117,8 +132,8 @@ def _linears(problem: Problem) -> list[Linear]:
     """Each record alone."""
     point = point_at(problem.groups, make_starts(problem, 1, 0))
     linear = linear_of(problem, point, 0, Squares(), False)
-    rows = zip(linear.rows, linear.slopes, linear.times, linear.weights, strict=True)
-    return [Linear((r,), (J,), (t,), (w,), linear.shared, False) for r, J, t, w in rows]
+    rows = zip(linear.rows, linear.slopes, linear.times, strict=True)
+    return [Linear((r,), (J,), (t,), linear.shared, 1.0, False) for r, J, t in rows]
 
 
 def _score(linear: Linear) -> float:

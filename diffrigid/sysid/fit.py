@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid.state import State
-from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian
+from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
 from diffrigid.sysid.free import Chart, Each, Free, Prior
 from diffrigid.sysid.levenberg import Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
@@ -163,7 +163,7 @@ def estimated_noise(problem: Problem, point: Point, loss: Any) -> dict[str, floa
 def _lost(problem: Problem, linear: Linear) -> dict[str, float]:
     """How many numbers the residuals of each column determine: sum of their leverages."""
     lost = dict.fromkeys(problem.noise, 0.0)
-    shared = from_jacobian(linear).covariance
+    shared = inverse(information(linear))
     for group in problem.groups:
         for k, member in enumerate(group.members):
             hat = leverages(linear, member, shared)

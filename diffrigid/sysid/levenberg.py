@@ -164,6 +164,12 @@ def _chosen(better: Array, whole: Array, new: Point, old: Point, members: tuple[
     return Point(z, tuple(r), tuple(jac))
 
 
+def best_by_record(groups: Sequence[Group], point: Point, loss: Any) -> np.ndarray:
+    """The start with the lowest cost for each record, (R,)."""
+    members = tuple(group.members for group in groups)
+    return np.asarray(_in_order(members, [_costs(loss, r) for r in point.residuals])).argmin(1)
+
+
 def _choose(better: Array, new: Array, old: Array) -> Array:
     """By the last axes."""
     return jnp.where(better.reshape((1,) * (new.ndim - better.ndim) + better.shape), new, old)

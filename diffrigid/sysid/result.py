@@ -18,7 +18,7 @@ from diffrigid.step import Trajectory, rollout
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
 from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
 from diffrigid.sysid.free import Free
-from diffrigid.sysid.levenberg import levenberg
+from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.parameters import Scene, Slot, knows, reference
 from diffrigid.sysid.setup import Problem, by_column, make_problem, make_starts, reach_of, scene_of, with_noise
 from diffrigid.sysid.table import html_table, text_table
@@ -159,20 +159,22 @@ class Fit:
         state = jax.tree.map(lambda leaf: leaf[extra:], motion.state) if extra else motion.state
         return Trajectory(t=motion.t[extra:], state=state, world=motion.world)
 
-    def score(self, observations: Any) -> dict[str, float]:
+    def score(self, observations: Any, starts: int = 1, seed: int = 0) -> dict[str, float]:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
 
-        Numbers that every record has for itself are found anew; without such, a record starts from its own state, by
-        default that of the first record of the fit.
+        Numbers that every record has for itself are found anew, from several starts if asked for; without such, a
+        record starts from its own state, by default that of the first record of the fit.
         """
         shared = replace(self.summary, parameters=tuple(p for p in self.parameters if not p.records))
         free, observe = self.problem.free, self.problem.observe
         problem = make_problem(self.world, self.state, observations, free=free, observe=observe, resume=shared)
         problem = with_noise(problem, {name: self.noise.get(name, s) for name, s in problem.noise.items()})
-        z, reach = make_starts(problem, 1, 0), reach_of(problem, range(problem.sizes[0]))
+        z, reach = make_starts(problem, starts, seed), reach_of(problem, range(problem.sizes[0]))
+        z = z._replace(shared=jnp.repeat(z.shared[:, :1], starts, axis=1))
         iterations = SCORED if problem.own else 0
         point, _ = levenberg(problem.groups, z, self.loss, iterations, reach, lambda count, costs: None)
-        found = by_column(problem, point, 0)
+        best = best_by_record(problem.groups, point, self.loss)
+        found = [by_column(problem, point, start)[k] for k, start in enumerate(best)]
         out = {}
         for name, sigma in problem.noise.items():
             values = np.concatenate([sigma * columns[name].ravel() for columns in found if name in columns])

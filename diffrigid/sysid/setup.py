@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,6 +18,7 @@ from diffrigid.step import floats
 from diffrigid.sysid.covariance import Linear
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, Point
+from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
 from diffrigid.sysid.problem import Group, circular, evaluate, known, linearise, make_groups
 from diffrigid.sysid.records import Run, noise_guess, runs
@@ -240,10 +242,22 @@ def linear_of(problem: Problem, point: Point, best: int, loss: Any, estimated: b
         values, slopes = np.asarray(r, float)[..., best], np.asarray(jac, float)[..., best]
         for k, member in enumerate(group.members):
             use, t = row_mask(problem, group, k, len(values))
-            mine = values[use, k]
-            rows[member] = (mine, slopes[use][..., k], t[use], np.asarray(loss.weight(jnp.asarray(mine)), float))
-    residuals, jacobians, times, weights = zip(*rows, strict=True)
-    return Linear(residuals, jacobians, times, weights, problem.sizes[0], estimated)
+            rows[member] = (values[use, k], slopes[use][..., k], t[use])
+    residuals, jacobians, times = zip(*rows, strict=True)
+    residuals, variance = _as_least_squares(loss, residuals, problem.sizes[0] + problem.sizes[1] * len(rows))
+    return Linear(residuals, jacobians, times, problem.sizes[0], variance, estimated)
+
+
+def _as_least_squares(loss: Any, residuals: tuple[np.ndarray, ...], numbers: int) -> tuple[Any, float]:
+    """Residuals that least squares would follow as the loss follows these, and their variance."""
+    if isinstance(loss, Squares):
+        return residuals, 1.0
+    joined = jnp.asarray(np.concatenate(residuals))
+    slope = jax.grad(lambda r: loss.rho(r).sum())
+    bend = float(jax.jvp(slope, (joined,), (jnp.ones_like(joined),))[1].mean())
+    parts = tuple(np.asarray(slope(jnp.asarray(r)), float) / max(bend, 0.05) for r in residuals)
+    variance = float(sum((part**2).sum() for part in parts) / max(len(joined) - numbers, 1))
+    return parts, variance
 
 
 def row_mask(problem: Problem, group: Group, k: int, rows: int) -> tuple[np.ndarray, np.ndarray]:

@@ -38,11 +38,21 @@ def _digits(value: float, low: float, high: float) -> int:
 def summary(fit: Any) -> str:
     """One line on the starts, the noise and the time."""
     noise = ", ".join(f"{name} {value:.3g}" for name, value in fit.noise.items())
-    return (
-        f"{fit.agree} of {len(fit.costs)} starts agree; noise: {noise}; {fit.seconds:.1f} s"
-        if len(fit.noise) <= 6
-        else f"{fit.agree} of {len(fit.costs)} starts agree; {fit.seconds:.1f} s"
-    )
+    parts = [f"{fit.agree} of {len(fit.costs)} starts agree{_others(fit)}"]
+    parts += [f"noise: {noise}"] if len(fit.noise) <= 6 else []
+    return "; ".join([*parts, f"{fit.seconds:.1f} s"])
+
+
+def _others(fit: Any) -> str:
+    """Where the starts that do not agree ended."""
+    others = fit.costs[fit.agree :]
+    finite = others[np.isfinite(others)]
+    texts = []
+    if len(finite):
+        texts.append(f"{len(finite)} ended at {finite[0] / max(fit.costs[0], 1e-300):.3g} times its cost or more")
+    if len(finite) < len(others):
+        texts.append(f"{len(others) - len(finite)} diverged")
+    return f" ({', '.join(texts)})" if texts else ""
 
 
 def text_table(fit: Any) -> str:
