@@ -38,12 +38,12 @@ class Free:
     def size(self, shape: tuple[int, ...]) -> int:
         return int(np.prod(shape))
 
-    def value(self, z: Array, reference: Any = None) -> Array:
+    def value(self, z: Any, reference: Any = None) -> Any:
         """z itself, low + exp(z), or low + (high - low) / (1 + exp(-z)), in the shape of the reference."""
         z = z if reference is None else z.reshape(jnp.shape(reference))
         if np.isfinite(self.high):
-            return self.low + (self.high - self.low) * jax.nn.sigmoid(z)
-        return z if np.isinf(self.low) else self.low + jnp.exp(z)
+            return self.low + (self.high - self.low) * (_sigmoid(z) if isinstance(z, np.ndarray) else jax.nn.sigmoid(z))
+        return z if np.isinf(self.low) else self.low + (np if isinstance(z, np.ndarray) else jnp).exp(z)
 
     def unbounded(self, reference: np.ndarray) -> np.ndarray:
         value = np.asarray(reference, float)
@@ -170,6 +170,12 @@ def prior(kind: Any, mean: Any, deviation: Any) -> Prior:
         raise ValueError(f"prior: deviation is {deviation}, expected > 0, in the unit of the parameter")
     flat = tuple(np.ravel(np.asarray(mean, float)).tolist())
     return Prior(kind=kind, mean=flat, deviation=tuple(np.ravel(np.asarray(deviation, float)).tolist()))
+
+
+def _sigmoid(z: np.ndarray) -> np.ndarray:
+    """In NumPy, without overflow: a result has a few numbers, and JAX would compile for each of them."""
+    small = np.exp(-np.abs(z))
+    return np.where(z >= 0, 1.0, small) / (1.0 + small)
 
 
 def _direction_size(shape: tuple[int, ...]) -> int:

@@ -128,7 +128,7 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
     return Arrow(A, B, D, eq.g * free[None], eq.h)
 
 
-@partial(jax.jit, static_argnames=("loss", "members"))
+@partial(jax.jit, static_argnames=("loss", "members"), compiler_options={"xla_cpu_use_fusion_emitters": False})
 def update(
     loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
 ) -> tuple[Progress, Numbers]:

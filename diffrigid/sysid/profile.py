@@ -44,7 +44,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> Profile:
     rise = np.maximum(_costs(fit, index, z) - fit.costs[0], 0.0)
     level = 0.5 * quantile**2
     low, high = _crossing(z, rise, level, -1), _crossing(z, rise, level, 1)
-    values = np.asarray(kind.value(jnp.asarray(np.array([*z, low, high]))), float)
+    values = kind.value(np.array([*z, low, high]))
     return Profile(name, values[:-2], rise, level, float(values[-2]), float(values[-1]))
 
 

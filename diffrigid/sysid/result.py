@@ -300,12 +300,11 @@ def _own_parameters(problem: Problem, own: np.ndarray, blocks: list[np.ndarray],
 
 def interval_of(slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, quantile: float):
     """Value, low and high end: through the map of z where it acts number by number, else to first order."""
-    dtype = jnp.result_type(about)
     deviation = np.sqrt(np.diag(covariance))
     if isinstance(slot.kind, Free):
         ends = (z, z - quantile * deviation, z + quantile * deviation)
-        return tuple(np.asarray(slot.kind.value(jnp.asarray(end, dtype), about), float) for end in ends)
-    centre = jnp.asarray(z, dtype)
+        return tuple(np.asarray(slot.kind.value(end, about), float) for end in ends)
+    centre = jnp.asarray(z, jnp.result_type(about))
     value = np.asarray(slot.kind.value(centre, about), float)
     slope = np.asarray(jax.jacfwd(slot.kind.value)(centre, about), float)
     if not np.isfinite(covariance).all():

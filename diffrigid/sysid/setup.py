@@ -228,8 +228,11 @@ def fitted_scenes(problem: Problem, shared: np.ndarray, own: np.ndarray) -> list
     for group in problem.groups:
         for k in group.members:
             z = jnp.asarray(np.concatenate([shared, own[:, k]]), problem.runs[k].state.x.dtype)
-            out[k] = put(group.plan.slots, scene_of(problem.runs[k]), z)
+            out[k] = _put(group.plan.slots, scene_of(problem.runs[k]), z)
     return out
+
+
+_put = jax.jit(put, static_argnames="slots")
 
 
 # ---- a point as arrays of NumPy
