@@ -47,6 +47,7 @@ from diffrigid.sysid import (
     shares,
     student,
 )
+from diffrigid.view import Player, play
 from diffrigid.world import World, check
 
 __all__ = [
@@ -67,6 +68,7 @@ __all__ = [
     "Hull",
     "Marker",
     "Pinhole",
+    "Player",
     "Polygon",
     "Prismatic",
     "Record",
@@ -95,6 +97,7 @@ __all__ = [
     "material_point",
     "material_velocity",
     "momentum",
+    "play",
     "positive",
     "prior",
     "profile",

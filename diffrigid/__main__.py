@@ -16,13 +16,12 @@ from diffrigid.data import FRAME, SquareDrops, square_drops
 from diffrigid.paths import read, write
 from diffrigid.state import State
 from diffrigid.sysid import Free, command
-from diffrigid.view.report import Section, Series, chart, player, row, text_table, write_report
+from diffrigid.view.report import Section, Series, chart, row, text_table, write_report
 
 SIGMA = 0.5  # [mm], [degrees] weight of a residual of a drop: about its size
 STEPS = np.array([5e-3, 2e-3, 1e-5, 1e-4])  # restitution, friction, inertia, floor
 T95 = 2.365  # two-sided 95 % quantile of Student's t for eight drops, seven degrees of freedom
 FINE = 4  # simulated and drawn steps of a drop per measured frame
-APART = np.array([0.17, 0.17])  # [m] between two drawn drops, across and down
 CAMERA = 3e-3  # [m] noise of the three discs
 HERTZ, FRAMES, SEED = 60, 120, 7  # of the three discs
 TRUTH = {"restitution": 0.8, "middle.mass": 2.0, "left.v": (2.0, 0.1)}
@@ -240,17 +239,20 @@ def drop_table(fit: dr.Fit, spread: np.ndarray) -> tuple[list[tuple[str, ...]], 
     return table, float(narrow)
 
 
-def drop_player(fit: dr.Fit, t: np.ndarray, states: State, record: SquareDrops) -> dict:
-    """The drops side by side, in two rows."""
-    drops = len(record.trial)
-    cells = np.array([(k % (drops // 2), -(k // (drops // 2))) for k in range(drops)])
-    middle = np.nanmean(record.x[:, :, 0], axis=1)
-    shifts = APART * cells - np.column_stack([middle, np.zeros(drops)])
-    floor, ends = float(fit["floor.shape.offset"].value), APART[0] * np.array([-1.0, drops // 2])  # past both edges
-    levels = floor + APART[1] * np.unique(cells[:, 1])
-    lines = [np.column_stack([ends, [level, level]]) for level in levels]
-    measured = {name: (record.x[k], record.angle[k]) for k, name in enumerate(fit.world.names)}
-    return player(fit.world, t, states, measured, t_measured=record.t, speed=0.02, shifts=shifts, lines=lines)
+def drop_player(fit: dr.Fit, t: np.ndarray, states: State, record: SquareDrops) -> dr.Player:
+    """The drops side by side, each in a world of its own."""
+    shape = dr.HalfSpace(normal=(0.0, 1.0), offset=float(fit["floor.shape.offset"].value))
+    drag = next(force for force in fit.world.forces if isinstance(force, dr.Drag))
+    runs, measured = {}, {}
+    for k in range(len(record.trial)):
+        alone = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[:, k : k + 1], states)
+        inertia, half = float(fit.world.bodies.inertia[k]), (record.half, record.half)
+        square = dr.Body(dr.Box(half=half), mass=1.0, inertia=inertia, x=alone.x[0, 0], q=alone.q[0, 0])
+        bodies: dict[str, dr.Body | dr.Static] = {"square": square, "floor": dr.Static(shape)}
+        world, _ = dr.scene(bodies, gravity=(0.0, -record.gravity), forces=[drag])
+        runs[f"drop {k + 1}"] = dr.Trajectory(t=jnp.asarray(t), state=alone, world=world)
+        measured[f"drop {k + 1}"] = {"t": record.t, "square.x": record.x[k], "square.angle": record.angle[k]}
+    return dr.play(runs, measured, beside=True, speed=0.02, plot="angle", height=620)
 
 
 def drop_charts(fine_t: np.ndarray, states: State, record: SquareDrops, residuals: np.ndarray) -> list[str]:
@@ -311,12 +313,11 @@ def disc_section(progress: bool | None) -> Section:
     )  # fmt: skip
     noise = ", ".join(f"{1e3 * value:.2f} mm ({name.split('.')[0]})" for name, value in fit.noise.items())
     values = {"frames": len(t), "hertz": HERTZ, "camera": 1e3 * CAMERA, "starts": len(fit.costs), "agree": fit.agree}
-    ghosts = {name: (measured[:, k], None) for k, name in enumerate(world.names)}
     return Section(
         title="Synthetic: three discs that collide",
         paragraphs=paragraphs(DISC_TEXT, noise=noise, **values),
         table=disc_table(fit),
-        player=player(fit.world, t, fit.trajectory.state, ghosts, t_measured=t, speed=0.5),
+        player=dr.play(fit.trajectory, observations, speed=0.5, plot="x"),
         charts=disc_charts(fit, t, measured),
     )
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.forces import is_constant, total_wrench
-from diffrigid.joints import joint_wrench
+from diffrigid.linkage import joint_wrench
 from diffrigid.numerics import safe_divide
 from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import State, Wrench, rotations, spin

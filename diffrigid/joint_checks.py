@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.convert import TYPED, known, nearest, numbers, stack
-from diffrigid.joints import JOINTS, Distance, Pose, jacobian, separation
+from diffrigid.joints import JOINTS, Distance, Pose, separation
+from diffrigid.linkage import jacobian
 from diffrigid.numerics import norm
-from diffrigid.pytree import array_fields, replace
+from diffrigid.pytree import array_fields, letters_of, replace
 from diffrigid.shapes import traced
 from diffrigid.state import rotations
 
@@ -42,7 +43,8 @@ def joints_of(
             raise ValueError(f"{name} joins {joint.a!r} to {joint.b!r}: expected one that moves; name a Body.")
         if joint.a == joint.b:
             raise ValueError(f"{name} joins {joint.a!r} to itself: expected two bodies.")
-        groups.setdefault(type(joint), []).append((name, _filled(name, joint, colliders, x, q, dim)))
+        filled = _filled(name, joint, colliders, x, q, dim)
+        groups.setdefault(jax.tree.structure(replace(filled, a=None, b=None)), []).append((name, filled))
     records, names = [], []
     for members in groups.values():
         names.append(tuple(name for name, _ in members))
@@ -65,19 +67,23 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
     elif "axis_a" in fields and joint.axis_a is None:
         raise ValueError(f"{name}.axis_a is missing: expected the axis of the hinge in the axes of {joint.a!r}, (3,).")
     given: dict[str, Any] = {}
+    shapes = {(): (), ("D",): (dim,), ("Q",): (so.Q,)}
     for field in fields:
         value = getattr(joint, field)
         if value is not None:
-            shape = {"length": (), "q": (so.Q,)}.get(field, (dim,))
+            shape = shapes[letters_of(joint, field)]
             array = numbers(f"{name}.{field}", value, None)
-            array = numbers(f"{name}.{field}", np.broadcast_to(array, shape) if array.ndim == 0 else array, shape)
+            array = numbers(f"{name}.{field}", array * np.ones(shape, array.dtype) if array.ndim == 0 else array, shape)
             given[field] = _unit(f"{name}.{field}", array) if field.startswith("axis") else array
     at_start = {
         "anchor_b": lambda a, b, given: so.unrotate(b.q, a.x + so.rotate(a.q, given["anchor_a"]) - b.x),
         "axis_b": lambda a, b, given: so.unrotate(b.q, so.rotate(a.q, given["axis_a"])),
         "q": lambda a, b, given: so.difference(b.q, a.q),
+        "zero": lambda a, b, given: so.difference(b.q, a.q),
         "length": lambda a, b, given: norm(separation(Distance(a=None, **given), so, a, b)),
     }
+    if not {"lower", "upper"} & set(given):
+        at_start.pop("zero")
     made = {field: known(at_start[field], a, b, given) for field in fields if field in at_start and field not in given}
     filled = replace(joint, **given, **made, **ends)
     error = known(lambda joint, a, b: joint(so, a, b), filled, a, b)
@@ -86,7 +92,30 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
             f"{name} does not hold at the start: it is off by {np.linalg.norm(error):.3g} (m, rad); move a body, or "
             "leave out what belongs to b, which is then taken from the start."
         )
+    _check_drive(name, filled, so, a, b)
     return filled
+
+
+def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:
+    """Raise ValueError for limits, friction or damping that cannot be."""
+    given = {f: getattr(joint, f, None) for f in ("lower", "upper", "restitution", "friction", "speed", "damping")}
+    number = {f: float(value) for f, value in given.items() if value is not None and not traced(value)}
+    lower, upper = number.get("lower", -np.inf), number.get("upper", np.inf)
+    if not lower < upper:
+        raise ValueError(f"{name}.lower is {lower:g} and upper {upper:g}: expected lower < upper; swap them.")
+    for field in ("friction", "damping"):
+        if number.get(field, 0.0) < 0:
+            raise ValueError(f"{name}.{field} is {number[field]:g}: expected 0 or above; 0 turns it off.")
+    if not 0.0 <= number.get("restitution", 0.0) <= 1.0:
+        raise ValueError(f"{name}.restitution is {number['restitution']:g}: expected a number from 0 to 1.")
+    if "speed" in number and given["friction"] is None:
+        raise ValueError(f"{name}.speed needs friction, the most that the motor can do: give friction.")
+    if "restitution" in number and given["lower"] is None and given["upper"] is None:
+        raise ValueError(f"{name}.restitution is that at its limits, and it has none: give lower or upper.")
+    if {"lower", "upper"} & set(number):
+        at: Any = known(lambda joint, a, b: joint.coordinate(so, a, b), joint, a, b)
+        if not traced(at) and not lower - TYPED <= at <= upper + TYPED:
+            raise ValueError(f"{name} starts at {float(at):g}, outside its limits {lower:g} to {upper:g}: move a body.")
 
 
 def warn_of_torn_joints(world: Any, state: Any) -> None:

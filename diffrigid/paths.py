@@ -9,7 +9,6 @@ BODY.x | v | q | w | angle               initial state (angle: 2D)
 STATIC.x | q | angle | restitution | friction | shape.FIELD
 """
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -18,7 +17,7 @@ from jax import Array
 from diffrigid import so2
 from diffrigid.convert import nearest
 from diffrigid.forces import Gravity
-from diffrigid.pytree import array_fields, replace
+from diffrigid.pytree import array_fields, letters_of, replace
 from diffrigid.state import State
 from diffrigid.world import World
 
@@ -147,7 +146,7 @@ def _set(record: Any, field: str, place: Place, path: str, value: Any) -> Array:
 
 def _axes(record: Any, field: str, place: Place) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Shape of the value of a place in one world, and the batch axes that its leaf has behind it."""
-    letters = next(f.metadata["letters"] for f in dataclasses.fields(record) if f.name == field)
+    letters = letters_of(record, field)
     letters = letters[0](record) if letters and callable(letters[0]) else letters
     rank = len(letters) - (letters[:1] in (("N",), ("S",)) and place.row is not None)
     shape = getattr(record, field).shape[place.row is not None :]

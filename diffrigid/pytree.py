@@ -95,3 +95,8 @@ def align(node, rank: int):
 def array_fields(record) -> list[str]:
     """Names of the float leaves of a record."""
     return [field.name for field in dataclasses.fields(record) if "letters" in field.metadata]
+
+
+def letters_of(record, name: str) -> tuple:
+    """Letters of the axes of a float leaf, for one world."""
+    return next(field.metadata["letters"] for field in dataclasses.fields(record) if field.name == name)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.flight import Flight, launch
-from diffrigid.joints import onto_joints
+from diffrigid.linkage import onto_joints
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.state import State
 from diffrigid.world import World, check
@@ -26,6 +26,15 @@ class Trajectory:
     t: Array = array("T")  # (T+1,) [s], from 0, or the given times
     state: State
     world: World
+
+    def _repr_html_(self) -> str | None:
+        """The motion itself, in a notebook; a batch is shown as text."""
+        from diffrigid.view import play  # the one import that points down, so that a result draws itself
+
+        try:
+            return play(self)._repr_html_()
+        except ValueError:
+            return None
 
 
 def step(world: World, state: State, dt: Array, controls: Any = None) -> State:

@@ -19,12 +19,18 @@ def drift_and_energy(bodies, friction, seconds=2.0):
     return float(jnp.abs(path.x - state.x[None]).max()), float(dr.kinetic_energy(world.bodies, end).sum())
 
 
-@pytest.mark.parametrize("load", [1.0, 100.0])
-def test_a_tower_stands_under_its_load(load):
+PILES = {  # places and masses of unit boxes
+    "a tower under 100 times its weight": [(0.0, 0.5 + i, 100.0 if i == 5 else 1.0) for i in range(6)],
+    # Every box shares its load between two, and its neighbours in the row may push or not.
+    "a pyramid of touching boxes": [(i + 0.5 * row, 0.5 + row, 1.0) for row in range(4) for i in range(4 - row)],
+}
+
+
+@pytest.mark.parametrize("pile", PILES)
+def test_a_pile_stands(pile):
     box = dr.Box(half=(0.5, 0.5))
-    masses = [1.0] * 5 + [load]
     drift, energy = drift_and_energy(
-        {f"{i}": dr.Body(box, mass=m, x=(0.0, 0.5 + i)) for i, m in enumerate(masses)}, 0.5
+        {f"{i}": dr.Body(box, mass=m, x=(x, y)) for i, (x, y, m) in enumerate(PILES[pile])}, 0.5
     )
     assert drift < STANDS
     assert energy < STANDS**2

@@ -24,20 +24,20 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
-from diffrigid.contact.cone import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.isolated import is_crowded, next_impacts, tables_of
+from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.resting import Strikes, solve_impulses
-from diffrigid.contact.sides import at_colliders, body_sides, same_bodies, side_sum
+from diffrigid.contact.sides import at_colliders, body_sides, side_sum
+from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.slots import meet
-from diffrigid.contact.strikes import MATERIALS, ends, find_strikes, material, may_meet, mixed
+from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
-from diffrigid.joints import islands, linkage, spread
-from diffrigid.numerics import FOUND, constant, dot, norm, rows, safe_divide
+from diffrigid.linkage import islands, linkage, spread
+from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
 IMPACT, HOLD, PUSH = 0, 1, 2
-CREEP = 1e-6  # [m/s] of a slip that is none
 
 
 @pytree
@@ -66,7 +66,7 @@ class Contact:
             launch: `(state, t0) -> Flight`, free motion to dt from states at their own times t0 (N, *batch).
         """
         t0 = jnp.zeros_like(state.x[:, 0])
-        if not world.pairs:
+        if not ends(world)["a"]:
             return state_at(launch(state, t0), dt)
         start = Anchors(state=state, t0=t0, since=t0 - dt[None])
         # In a crowd some pair is always near, and times are found fast.
@@ -76,8 +76,8 @@ class Contact:
 
     def _passes(self, world: Any, start: Anchors, launch: Callable, dt: Array, near: Array) -> Anchors:
         """The anchors after all passes; there are none unless some pair is `near`, a bool."""
-        contacts = sum(len(pairs.a) * pairs.count for pairs in world.pairs)
-        resting = jnp.zeros((contacts, *start.t0.shape[1:]), bool)
+        always = driven(world)  # what acts in every step, and needs no impact before
+        resting = jnp.broadcast_to(_rows_of(always, start.t0), (len(always), *start.t0.shape[1:]))
 
         # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches.
         @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
@@ -111,7 +111,7 @@ class Contact:
             return lax.cond(needed, lambda c: some_pass(*c, phase), lambda c: c, carry), None
 
         phases = jnp.array([IMPACT] * self.sweeps + [HOLD, PUSH])
-        (end, *_), _ = lax.scan(maybe, (start, resting, near, jnp.asarray(False)), phases)
+        (end, *_), _ = lax.scan(maybe, (start, resting, near, jnp.asarray(any(always))), phases)
         return end
 
 
@@ -120,8 +120,8 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     impact, push = phase == IMPACT, phase == PUSH
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
-    index = ends(world)
-    restitution, friction = (mixed(*(material(world, name, index[side]) for side in "ab")) for name in MATERIALS)
+    restitution, friction = coefficients(world, dt.shape)
+    drives = _rows_of(driven(world), dt[None])
     u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
     slow = u <= world.contact.rest_speed[None]
     hang_together = islands(world.joints, len(world.names))
@@ -129,22 +129,32 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     closing = -jax.vmap(dot)(strikes.normal, strikes.pull)
     rests = slow | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
     found = resting | (strikes.active & (slow | (now & rests)))
-    held = jnp.where(push, resting, strikes.active & (resting | _falls_along(flight, world, u, dt)))
+    held = jnp.where(push, resting & ~drives, strikes.active & (resting | _falls_along(flight, world, u, dt)))
     now, resting = jnp.where(impact, now, held), jnp.where(impact, found, held)
-    target = jnp.where(rests | ~impact, 0.0, restitution * u)
-    v_rel = jnp.where(push, jnp.minimum(strikes.gap, 0.0)[:, None] * strikes.normal, strikes.v_rel)
+    began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
+    held_for = jnp.where(impact | push, 0.0, dt[None] - began)
+    # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
+    may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(strikes.gap, 0.0), held_for), 0.0)
+    at_rest = jnp.where(impact | push | (strikes.gap <= 0), 0.0, may_close)
+    target, force = driving(world, jnp.where(impact & ~rests, restitution * u, at_rest))
+    v_rel = jnp.where(push, strikes.gap[:, None] * strikes.normal, strikes.v_rel)
     strikes = replace(strikes, active=now, v_rel=v_rel)
 
     def strike(anchors):
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         evenly = 0.5 * (dt[None] - anchors.t0)
         lever = jnp.where(impact, 0.0, jnp.where(push, 1.0, evenly))
-        began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
-        held_for = jnp.where(impact | push, 0.0, dt[None] - began)
-        return _apply(world, anchors, flight, strikes, target, jnp.where(push, 0.0, friction), kick, lever, held_for)
+        most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
+        mu = jnp.where(push, 0.0, friction)
+        return _apply(world, anchors, flight, strikes, (target, mu, most), kick, lever, held_for)
 
     any_now = jnp.any(now)
     return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, jnp.any(resting)
+
+
+def _rows_of(flags: tuple[bool, ...], like: Array) -> Array:
+    """Flags of contacts as an array with the batch axes of `like`, (C, 1, ...)."""
+    return jnp.asarray(constant(flags, "bool")).reshape(len(flags), *[1] * (like.ndim - 1))
 
 
 def _falls_along(flight: Flight, world: Any, u: Array, dt: Array) -> Array:
@@ -183,8 +193,7 @@ def _apply(
     anchors: Anchors,
     flight: Flight,
     strikes: Strikes,
-    target,
-    mu,
+    law: tuple[Array, Array, Array | None],
     kick: Array,
     lever: Array,
     held_for: Array,
@@ -194,6 +203,7 @@ def _apply(
     Anchoring is the lever x += (h - s) P / m and, for turns, the composition of those before and after s.
 
     Args:
+        law: target, mu and most of `solve_impulses`.
         kick: 1, or 0 for a displacement that leaves velocities as they are.
         lever: (N, *batch) [s] displacement per change of velocity.
         held_for: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
@@ -207,13 +217,13 @@ def _apply(
     onto = _onto_joints(flight, t, mobility, (count > 0) & (kick > 0))
     if onto is not None:
         strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
-    P = solve_impulses(strikes, target, mu, mobility, own[:, 0], world.contact.rest_speed)
+    P = solve_impulses(strikes, *law, mobility, own[:, 0], world.contact.rest_speed)
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    early_P = _stopping_early(strikes, P, mu, held_for)
+    early_P = stopping_early(strikes, P, law, held_for)
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
-    kept = _keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
-    kept = kept + _keeping_spin(strikes, _drift_after(strikes, dv), early_P, moving)
+    kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
+    kept = kept + keeping_spin(strikes, drift_after(strikes, dv), early_P, moving)
     kicked = kick * dv, kick * dL + kept
     if onto is not None:
         kicked = kicked[0] + onto[0], kicked[1] + onto[2]
@@ -231,49 +241,6 @@ def _onto_joints(flight: Flight, t: Array, mobility: Mobility, hit: Array) -> tu
     apply, on = rotations(flight.dim).apply, hit[:, None].astype(t.dtype)
     v, L = jax.vmap(velocity)(flight, t), jax.vmap(angular_momentum)(flight, t)
     return spread(mobility.link, on * v, on * jax.vmap(apply)(mobility.inverse_inertia, L))
-
-
-def _keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array:
-    """Changes of L (N, A, *batch) that go with displacements P / m of two bodies of which one drifts from the other.
-
-    They move the angular momentum about the origin by P x (v_a - v_b): both bodies give back half of it.
-    """
-    return momentum_changes(replace(strikes, arm_a=drift, arm_b=-drift), P, moving)[1]
-
-
-def _drift_after(strikes: Strikes, dv: Array) -> Array:
-    """Half the velocity of a against b after changes dv of the bodies (N, D, *batch), 0 at a static; (C, D, *batch)."""
-    both = constant(tuple(float(max(pair) < len(dv)) for pair in zip(strikes.a, strikes.b, strict=True)), str(dv.dtype))
-    change = 0.5 * (at_colliders(dv, strikes.a, 0.0) - at_colliders(dv, strikes.b, 0.0))
-    return strikes.drift + both.reshape(-1, *[1] * (dv.ndim - 1)) * change
-
-
-def _stopping_early(strikes: Strikes, P: Array, mu: Array, T: Array) -> Array:
-    """What the impulses P, taken as even over T, move too little where the slip stops before: (C, D, *batch) [N s^2].
-
-    Friction first stops the slip with all of its bound, then holds against the pull, evenly. Stopping takes the
-    part of P that goes with the slip at the beginning, with its centroid at half the time tau until the stop instead
-    of T / 2: so it moves the contact by a further (T - tau) / 2. Exact for one direction of slip under a constant pull.
-    """
-    n, together = strikes.normal, same_bodies(strikes.a, strikes.b)
-
-    def in_all(values: Array) -> Array:  # over the contacts of the same two bodies, which slip as one
-        return rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), together).sum(1)
-
-    def across(r: Array) -> Array:
-        return r - jax.vmap(dot)(n, r)[:, None] * n
-
-    at_end, friction = across(strikes.v_rel), across(P)
-    slip = at_end - T[:, None] * across(strikes.pull)
-    speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
-    along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
-    size, bound = jax.vmap(norm)(in_all(friction)), in_all(mu * jax.vmap(dot)(n, P))
-    whole = jnp.where(speed > CREEP, at_end_speed * bound + size * (speed - along), 0.0)
-    share = safe_divide(speed * size, whole)  # tau / T
-    stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0) & (speed > CREEP)
-    per_speed = safe_divide(own, jnp.where(stops, at_end_speed, 0.0))
-    lost = 0.5 * T * (1.0 - jnp.clip(share, 0.0, 1.0)) * per_speed
-    return jnp.where(stops[:, None], -lost[:, None] * slip, 0.0)
 
 
 def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility]:

@@ -1,11 +1,15 @@
 """Many contacts at once: those that share a body at the same time, in an impact or at rest."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.contact.cone import Arms, Cone, Mobility, solve_together
+from diffrigid.contact.cone import Cone
 from diffrigid.contact.impulse import impulses
+from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sides import at_colliders
+from diffrigid.contact.together import solve_together
 from diffrigid.numerics import safe_sqrt
 from diffrigid.pytree import array, pytree, static
 
@@ -22,33 +26,36 @@ class Strikes:
     arm_b: Array = array("C", "D")
     K: Array = array("C", "D", "D")  # [1/kg] effective matrix
     v_rel: Array = array("C", "D")  # [m/s] of a against b at the contact point, before the impulse
-    pull: Array = array("C", "D")  # [m/s^2] acceleration of a against b, of the centres
+    pull: Array = array("C", "D")  # [m/s^2] acceleration of a against b there
     drift: Array = array("C", "D")  # [m/s] half the velocity of a against b, of the centres; 0 at a static
     a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
     b: tuple[int, ...] = static(default=())
+    jac: Any = array("R", "2", "D + A", default=None)  # of the last R, which are rows of joints; see `Arms`
 
 
 def solve_impulses(
-    strikes: Strikes, target: Array, mu: Array, mobility: Mobility, crowd: Array, rest_speed: Array
+    strikes: Strikes, target: Array, mu: Array, most: Array | None, mobility: Mobility, crowd: Array, rest_speed: Array
 ) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
-    A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `cone.py`.
+    A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `together.py`.
 
     Args:
         target: (C, *batch) [m/s] normal velocity after the impulse.
         mu: (C, *batch) [-].
+        most: (C, *batch) [N s] of the normal impulse, to both sides; where infinite it pushes, without bound. None:
+            so everywhere.
         crowd: (N, *batch) number of active contacts of each body.
         rest_speed: (*batch) [m/s] what is slow in these worlds.
     """
-    most = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
-    most = lax.stop_gradient(most)
-    shared = strikes.active & ((most > 1) | (mobility.link is not None))
+    others = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
+    others = lax.stop_gradient(others)
+    shared = strikes.active & ((others > 1) | (mobility.link is not None))
     alone = impulses(strikes.active & ~shared, strikes.K, strikes.normal, strikes.v_rel, target, mu)
     scale = lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
     cone = Cone(
-        on=shared.astype(most.dtype), crowd=jnp.maximum(most, 1.0), scale=scale, normal=strikes.normal,
-        target=target, mu=mu, rest_speed=rest_speed,
+        on=shared.astype(others.dtype), crowd=jnp.maximum(others, 1.0), scale=scale, normal=strikes.normal,
+        target=target, mu=mu, most=most, rest_speed=rest_speed,
     )  # fmt: skip
-    arms = Arms(arm_a=strikes.arm_a, arm_b=strikes.arm_b, a=strikes.a, b=strikes.b)
+    arms = Arms(arm_a=strikes.arm_a, arm_b=strikes.arm_b, jac=strikes.jac, a=strikes.a, b=strikes.b)
     return alone + solve_together(jnp.any(shared), cone, strikes.v_rel, arms, mobility)

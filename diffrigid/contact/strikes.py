@@ -1,4 +1,4 @@
-"""The contacts of all pairs of a world as one list, whatever their kinds."""
+"""The contacts of all pairs of a world, and the rows of its joints, as one list, whatever their kinds."""
 
 from typing import Any
 
@@ -10,7 +10,8 @@ from jax import Array, lax
 from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix
 from diffrigid.contact.resting import Strikes
-from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
+from diffrigid.contact.sides import Placed, Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
+from diffrigid.contact.stops import find_stops, is_drive, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
 from diffrigid.numerics import apart, constant, dot, norm, rows
@@ -29,11 +30,16 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
         each = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, at_end, width))
         part = apart(jnp.any(dt > 0), each, *sides_of(world, pairs, flight, since))
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
+    jac = None
+    if stops_of(world):
+        stops = find_stops(world, flight, since, dt, at_end)
+        jac = stops.jac
+        parts.append(replace(stops, jac=None))
     if len(parts) > 1:
         strikes = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
     else:
         strikes = parts[0]
-    return replace(strikes, **ends(world))
+    return replace(strikes, **ends(world), jac=jac)
 
 
 def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Strikes:
@@ -49,8 +55,10 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
     live = jnp.any(dt > 0)
     at_a, at_b = place(a, s, live), place(b, s, live)
     contacts = contacts_of(a, at_a, b, at_b)
-    active = (contacts.gap <= (level + slack)[None]) & hit[None]
-    pull, drift = _acceleration(at_a, at_b), jnp.zeros_like(at_a.x)
+    # At the end those too that the next of a pile fell away from, which may close again once it is held.
+    opened = jnp.where(at_end, dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None), 0.0)
+    active = (contacts.gap <= (level + slack + opened)[None]) & hit[None]
+    drift = jnp.zeros_like(at_a.x)
     if both_move:
         drift = 0.5 * (at_a.v - at_b.v)  # type: ignore[operator]
         held = jnp.where(at_end, 0.5 * (dt - jnp.maximum(a.flight.t0, b.flight.t0)), 0.0)
@@ -59,6 +67,8 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
     def each(normal, point, gap):
         shift = mid_shift if both_move else jnp.where(at_end, 0.5 * gap, 0.0)[None] * normal
         arm_a, arm_b = point - at_a.x + shift, point - at_b.x - shift
+        pulls = [_acceleration(side, at, s, arm) for side, at, arm in ((a, at_a, arm_a), (b, at_b, arm_b))]
+        pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
         return Strikes(
             active=gap < 0, s=s, gap=gap, normal=normal, arm_a=arm_a, arm_b=arm_b,
             K=effective_matrix(at_a, arm_a, at_b, arm_b), v_rel=relative_velocity(at_a, arm_a, at_b, arm_b),
@@ -95,23 +105,34 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
         return jnp.any(apart <= dt * (closing + 0.5 * dt * pull) + margin)
 
     since = jnp.zeros_like(flight.t0)
+    if stops_of(world):
+        return jnp.asarray(True)
     near = [jnp.any(jax.vmap(one)(*sides_of(world, pairs, flight, since))) for pairs in world.pairs]
     return jnp.any(jnp.stack(near))
 
 
 def ends(world: Any) -> dict[str, tuple[int, ...]]:
-    """Colliders a and b of every contact of the list."""
+    """Colliders a and b of every contact of the list, and of the rows of joints after them."""
 
     def column(of):
         return tuple(int(i) for pairs in world.pairs for i in np.repeat(of(pairs), pairs.count))
 
-    return {"a": column(lambda pairs: pairs.a), "b": column(lambda pairs: pairs.b)}
+    a, b = column(lambda pairs: pairs.a), column(lambda pairs: pairs.b)
+    return {"a": a + stop_ends(world, "a"), "b": b + stop_ends(world, "b")}
 
 
-def _acceleration(at_a, at_b) -> Array:
-    if at_b.v is None:
-        return at_a.a
-    return -at_b.a if at_a.v is None else at_a.a - at_b.a
+def _acceleration(side: Side, at: Placed, s: Array, arm: Array) -> Array | None:
+    """Of a point of a collider from its anchor to s, (D, *batch) [m/s^2], in the mean, by forces and torques on it."""
+    f = side.flight
+    if f is None:
+        return None
+    half = 0.5 * (s - f.t0)[None]
+    a = f.a if f.jolt is None else f.a + half * f.jolt
+    if f.tau is None:
+        return a
+    so = rotations(f.dim)
+    tau = f.tau if f.twist is None else f.tau + half * f.twist
+    return a + so.cross(so.apply(at.inverse_inertia, tau), arm)
 
 
 MATERIALS = ("restitution", "friction")
@@ -133,6 +154,41 @@ def material(world: Any, name: str, colliders: tuple[int, ...]) -> Material:
     own = getattr(world, f"own_{name}")
     given = constant(tuple(float(own[i]) for i in colliders), str(values.dtype))
     return Material(value=rows(values, colliders), given=lax.expand_dims(given, range(1, values.ndim)))
+
+
+def coefficients(world: Any, batch: tuple[int, ...]) -> tuple[Array, Array]:
+    """Restitution and friction of all contacts and rows, (C, *batch) [-] or what broadcasts."""
+    index = {side: ends(world)[side][: contact_count(world)] for side in "ab"}
+    limits = ("lower", "upper")
+    both = []
+    for name in MATERIALS:
+        parts = [mixed(*(material(world, name, index[side]) for side in "ab"))] if world.pairs else []
+        if stops_of(world):
+            parts.append(of_stops(world, "restitution", limits if name == "restitution" else (), 0.0, batch))
+        whole = [jnp.broadcast_to(part, part.shape[:1] + batch) for part in parts]
+        both.append(jnp.concatenate(whole) if len(parts) > 1 else parts[0])
+    return both[0], both[1]
+
+
+def driven(world: Any) -> tuple[bool, ...]:
+    """Of all contacts and rows: friction or a motor of a joint, which acts to both sides, in every step."""
+    return (False,) * contact_count(world) + is_drive(world)
+
+
+def driving(world: Any, target: Array) -> tuple[Array, Array | None]:
+    """`target` with the speeds of motors put in, and the most that friction and motors do [N or N m]; None: no such."""
+    if not any(is_drive(world)):
+        return target, None
+    drives = jnp.asarray(constant(is_drive(world), "bool")).reshape(-1, *[1] * (target.ndim - 1))
+    speed, force = (of_stops(world, name, ("friction",), 0.0, target.shape[1:]) for name in ("speed", "friction"))
+    points = contact_count(world)
+    target = jnp.concatenate([target[:points], jnp.where(drives, speed, target[points:])])
+    return target, jnp.concatenate([jnp.zeros_like(target[:points]), force])
+
+
+def contact_count(world: Any) -> int:
+    """Contacts of all pairs, without the rows of joints."""
+    return sum(len(pairs.a) * pairs.count for pairs in world.pairs)
 
 
 def mixed(a: Material, b: Material) -> Array:

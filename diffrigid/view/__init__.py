@@ -1,5 +1,7 @@
-"""Drawing: outlines of shapes."""
+"""Drawing: an inline player, still pictures, and outlines of shapes."""
 
+from diffrigid.view.figures import energy, film, momentum, phase, strobe
 from diffrigid.view.outline import outline
+from diffrigid.view.play import Player, play
 
-__all__ = ["outline"]
+__all__ = ["Player", "energy", "film", "momentum", "outline", "phase", "play", "strobe"]

@@ -1,28 +1,22 @@
 """A report of fits as one HTML file that needs nothing else: tables, players, charts, text.
 
-    write_report("report.html", "Title", "What this is.", [Section(title="...", player=player(...))])
+    write_report("report.html", "Title", "What this is.", [Section(title="...", player=play(...))])
 
-Everything is drawn from numbers: charts are SVG made here, a player is a canvas with its data beside it
-(`report.js`). Colours follow the light or dark scheme of the browser (`report.css`).
+Everything is drawn from numbers: charts are SVG made here, players are those of `play`, each in a frame of its own.
+Colours follow the light or dark scheme of the browser (`report.css`).
 """
 
 import html
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
-import jax
 import numpy as np
 
-from diffrigid.state import State
-from diffrigid.view.outline import outline
-from diffrigid.world import World
+from diffrigid.view.play import POLICY, Player
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "truth or published value")
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"  # nothing is ever loaded
 WIDTH, HEIGHT = 460, 250  # [px] of a chart
 LEFT, RIGHT, TOP, BOTTOM = 56, 12, 30, 42  # [px] its margins
 
@@ -36,7 +30,7 @@ class Section:
     title: str
     paragraphs: Sequence[str] = ()
     table: Sequence[Row] = ()  # rows under HEADER
-    player: Mapping[str, Any] | None = None  # from `player`
+    player: Player | None = None
     charts: Sequence[str] = ()  # SVG, from `chart`
     details: Mapping[str, str] | None = None  # summary -> HTML, folded away
 
@@ -54,17 +48,14 @@ class Series:
 
 def write_report(path: str | Path, title: str, lead: str, sections: Sequence[Section]) -> Path:
     """Write the file and return its path. Text is escaped; charts and details are put in as they are."""
-    here = files(__package__)
-    style, script = ((here / name).read_text(encoding="utf-8") for name in ("report.css", "report.js"))
+    style = (files(__package__) / "report.css").read_text(encoding="utf-8")
     page = (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>\n'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
         f"<style>\n{style}</style></head>\n<body><main>\n<h1>{html.escape(title)}</h1>\n"
-        f'<p class="lead">{html.escape(lead)}</p>\n'
-        + "".join(map(_section, sections))
-        + f"</main>\n<script>\n{script}</script></body></html>\n"
+        f'<p class="lead">{html.escape(lead)}</p>\n' + "".join(map(_section, sections)) + "</main></body></html>\n"
     )
     path = Path(path)
     path.write_text(page, encoding="utf-8")
@@ -96,36 +87,6 @@ def html_table(rows: Sequence[Row]) -> str:
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>\n'
 
 
-def player(
-    world: World, t: np.ndarray, states: State, measured: Mapping[str, tuple[np.ndarray, np.ndarray | None]], *,
-    t_measured: np.ndarray, speed: float, shifts: np.ndarray | None = None, lines: Sequence[np.ndarray] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Data of a player: the motion of every body as an outline, over what was measured of it. 2D.
-
-    Args:
-        t: (T,) [s] of states, whose leaves have a leading time axis.
-        measured: by body, positions (M, 2) [m] and angles (M,) [rad], None if not measured, at t_measured (M,) [s].
-        speed: at which it starts, 1 is real time.
-        shifts: (N, 2) [m] where to draw each body apart from its place; default: in its place.
-        lines: polylines (P, 2) [m] that do not move, as drawn.
-    """
-    x, q = np.asarray(states.x, float), np.asarray(states.q, float)
-    angle = np.unwrap(np.arctan2(q[..., 1], q[..., 0]), axis=0)
-    shifts = np.zeros((len(world.names), 2)) if shifts is None else shifts
-    shapes, bodies = _outlines(world), []
-    for index, name in enumerate(world.names):
-        poses = np.column_stack([x[:, index] + shifts[index], angle[:, index]])
-        place, turn = measured.get(name, (np.full((len(t_measured), 2), np.nan), None))
-        turn = np.zeros(len(place)) if turn is None else turn
-        ghosts = np.column_stack([place + shifts[index], turn])
-        columns = {"outline": shapes[name], "fit": poses, "measured": ghosts}
-        bodies.append({"name": name} | {key: _numbers(column) for key, column in columns.items()})
-    return {
-        "t": _numbers(t), "t_measured": _numbers(t_measured), "speed": speed,
-        "bodies": bodies, "lines": [_numbers(line) for line in lines],
-    }  # fmt: skip
-
-
 def chart(title: str, x_label: str, y_label: str, series: Sequence[Series], width: int = WIDTH) -> str:
     """A chart as SVG: axes with ticks, lines and points, a legend above."""
     x_range = _range([s.x[np.isfinite(s.y)] for s in series], 0.0)
@@ -153,8 +114,7 @@ def _section(section: Section) -> str:
     if section.table:
         parts.append(html_table(section.table))
     if section.player is not None:
-        data = json.dumps(section.player, separators=(",", ":")).replace("</", "<\\/")
-        parts.append(f'<figure class="player"><script type="application/json">{data}</script></figure>\n')
+        parts.append(f"<figure>{section.player._repr_html_()}</figure>\n")
     parts += [f"<p>{html.escape(paragraph)}</p>\n" for paragraph in section.paragraphs]
     if section.charts:
         parts.append('<div class="charts">\n' + "".join(section.charts) + "</div>\n")
@@ -170,29 +130,6 @@ def _digits(value: float, low: float, high: float) -> int:
     if not np.isfinite(width) or width == 0 or size == 0:
         return 4
     return int(np.clip(np.ceil(np.log10(size / width)) + 2, 2, 12))
-
-
-def _outlines(world: World) -> dict[str, np.ndarray]:
-    """Outline (P, 2) [m] of every body, about its centre of mass."""
-    found = {name: np.zeros((1, 2)) for name in world.names}
-    for shape, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
-        for index, owner in enumerate(owners):
-            if owner < len(world.names):
-                at = np.zeros(2) if offset is None else np.asarray(offset.r[index])
-                found[world.names[owner]] = outline(_row_of(shape, index), 2) + at
-    return found
-
-
-def _row_of(record: Any, index: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[index], record)
-
-
-def _numbers(array: Any) -> list:
-    """Nested lists with 5 decimals (10 micrometres); a row with NaN becomes None."""
-    array = np.round(np.asarray(array, float), 5)
-    if array.ndim == 1:
-        return array.tolist()
-    return [line.tolist() if np.isfinite(line).all() else None for line in array]
 
 
 def _range(columns: Sequence[np.ndarray], margin: float) -> tuple[float, float]:

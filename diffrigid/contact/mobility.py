@@ -1,0 +1,145 @@
+"""From impulses at contacts to changes of the bodies' velocities and back: J, G and J G J^T of `together`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid.contact.sides import at_colliders, between_bodies, side_sum
+from diffrigid.linkage import Linkage, spread
+from diffrigid.numerics import dot, identity, inverse_matrix, rows, unit_vector
+from diffrigid.pytree import array, pytree, static
+from diffrigid.state import rotations
+
+
+@pytree
+class Arms:
+    """Where C contacts act on their bodies; fields as in `Strikes`, which will do as well.
+
+    The last R of them, those that `jac` is of, are rows along coordinates of joints: the first component of their
+    velocities is the rate of a coordinate, that of their impulses acts along it, and they have no others.
+    """
+
+    arm_a: Array = array("C", "D")
+    arm_b: Array = array("C", "D")
+    jac: Any = array("R", "2", "D + A", default=None)  # of each coordinate by the twists of a and b
+    a: tuple[int, ...] = static()
+    b: tuple[int, ...] = static()
+
+
+@pytree
+class Mobility:
+    """What turns impulses on the N moving bodies into changes of velocity."""
+
+    inverse_mass: Array = array("N")  # [1/kg]
+    inverse_inertia: Any = None  # [1/(kg m^2)] world axes
+    link: Linkage | None = None  # of the joints between them
+
+
+def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
+    """Changes of m v (N, D) [N s] and L (N, A) [N m s] of the moving bodies by the impulses P on side a.
+
+    Args:
+        arms: with the fields of `Arms`.
+    """
+    so = rotations(P.shape[1])
+    points, along = len(P) - _rows(arms), P[len(P) - _rows(arms) :, :1]
+    P = P[:points]
+    on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a[:points], P)], axis=1)
+    on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b[:points], -P)], axis=1)
+    if arms.jac is not None:
+        on_a, on_b = (jnp.concatenate([on, along * arms.jac[:, side]]) for side, on in enumerate((on_a, on_b)))
+    total = side_sum(on_a, on_b, arms.a, arms.b, moving)
+    return total[:, : so.D], total[:, so.D :]
+
+
+def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, Array]:
+    """Changes of v [m/s], w [rad/s] and L by impulses dp and dL on the bodies, and by what the joints make of them."""
+    apply = rotations(dp.shape[1]).apply
+    dv, dw = mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL)
+    if mobility.link is None:
+        return dv, dw, dL
+    more = spread(mobility.link, dv, dw)
+    return dv + more[0], dw + more[1], dL + more[2]
+
+
+def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
+    """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
+    so, both = rotations(dv.shape[1]), jnp.concatenate([dv, dw], axis=1)
+    at_a, at_b = at_colliders(both, arms.a, 0.0), at_colliders(both, arms.b, 0.0)
+
+    def point_velocity(at, arm):
+        return at[: so.D] + so.cross(at[so.D :], arm)
+
+    points = len(arms.a) - _rows(arms)
+    on_a, on_b = (
+        jax.vmap(point_velocity)(at[:points], arm[:points]) for at, arm in ((at_a, arms.arm_a), (at_b, arms.arm_b))
+    )
+    if arms.jac is None:
+        return on_a - on_b
+    rates = (arms.jac * jnp.stack([at_a[points:], at_b[points:]], axis=1)).sum((1, 2))
+    return jnp.concatenate([on_a - on_b, _first(rates, so.D)])
+
+
+def _rows(arms: Any) -> int:
+    return 0 if arms.jac is None else len(arms.jac)
+
+
+def _first(values: Array, D: int) -> Array:
+    """Numbers (R, *batch) as the first component of vectors, (R, D, *batch)."""
+    return values[:, None] * unit_vector(jnp.zeros((D, *values.shape[1:]), values.dtype), 0)[None]
+
+
+def twists(P: Array, arms: Any, mobility: Mobility) -> Array:
+    """G J^T P: the change of the twists of all bodies by impulses, (C, *batch)."""
+    dv, dw, _ = velocities(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
+    return jnp.concatenate([dv, dw], axis=1).reshape(-1, *P.shape[2:])
+
+
+def bodies_inverse(answer: Callable, arms: Any, mobility: Mobility) -> Array:
+    """Inverse of 1 + G J^T A J, (R, R, *batch) with R components of the twists of all bodies.
+
+    Args:
+        answer: the linear map A, contact by contact: impulses (C, D, *batch) for relative velocities.
+    """
+    moving, (D, *batch) = mobility.inverse_mass.shape[0], arms.arm_a.shape[1:]
+    so = rotations(D)
+    size = D + so.A
+    J_a, J_b = (jax.vmap(lambda arm: _by_units(so, arm))(arm) for arm in (arms.arm_a, arms.arm_b))  # (C, size, D)
+    if arms.jac is not None:
+        points, by_twist = len(arms.a) - len(arms.jac), jax.vmap(lambda jac: _first(jac, D))
+        J_a = jnp.concatenate([J_a[:points], by_twist(arms.jac[:, 0])])
+        J_b = jnp.concatenate([J_b[:points], -by_twist(arms.jac[:, 1])])
+
+    def answers(J):  # of each contact to unit twists of one of its bodies: impulses
+        return jnp.swapaxes(jax.vmap(answer)(jnp.swapaxes(J, 0, 1)), 0, 1)
+
+    def block(J, back):  # J^T back, (C, size, size)
+        each = jax.vmap(jax.vmap(dot, (None, 0)), (0, None))
+        return jax.vmap(each)(J, back)
+
+    back_a, back_b = answers(J_a), answers(J_b)
+    own = side_sum(block(J_a, back_a), block(J_b, back_b), arms.a, arms.b, moving)
+    diagonal = jnp.eye(moving, dtype=own.dtype).reshape(moving, moving, *[1] * (own.ndim - 1))
+    whole = diagonal * own[:, None]
+    between = between_bodies(arms.a, arms.b, moving)
+    if between is not None:
+        across = -jnp.concatenate([block(J_a, back_b), block(J_b, back_a), jnp.zeros_like(own[:1])])
+        whole = whole + rows(across, between).sum(1).reshape(moving, moving, size, size, *batch)
+    columns = jnp.moveaxis(whole, (1, 3), (0, 1)).reshape(moving * size, moving, size, *batch)
+
+    def moved(column):
+        dv, dw, _ = velocities(mobility, column[:, :D], column[:, D:])
+        return jnp.concatenate([dv, dw], axis=1).reshape(-1, *batch)
+
+    matrix = jax.vmap(moved, out_axes=1)(columns)
+    return inverse_matrix(identity(matrix) + matrix)
+
+
+def _by_units(so: Any, arm: Array) -> Array:
+    """Velocity at an arm (D, *batch) for each unit twist of its body, (D + A, D, *batch)."""
+    size, batch = so.D + so.A, arm.shape[1:]
+    units = jnp.eye(size, dtype=arm.dtype).reshape(size, size, *[1] * len(batch))
+    return jax.vmap(lambda unit: unit[: so.D] + so.cross(unit[so.D :], arm))(units + jnp.zeros_like(arm[:1])[None])

@@ -1,0 +1,106 @@
+"""The impulses of contacts that share bodies to a few digits, from anywhere: the method of multipliers.
+
+With velocities in which a slip opens the contact too, y + mu |y_t| n, Coulomb's law is that between a cone and its
+dual: P lies in the cone of friction, y + mu |y_t| n - target n in its dual, and the two are orthogonal. With
+`nearest` the projection onto the cone and any sigma > 0 that is
+
+    P = nearest(z),   z = P - sigma (y + mu |y_t| n - target n),   y = v_rel + J u,   u = G J^T P
+
+For given multipliers P inside z and given slip, u = G J^T nearest(z) is where a convex function of u is least, so
+Newton's method with a line search finds it from anywhere, however many contacts repeat each other. Then nearest(z) are
+the next multipliers.
+Source: De Saxce & Feng, Mathematical and Computer Modelling 28 (1998) 225, for the law; Bertsekas, Constrained
+Optimization and Lagrange Multiplier Methods, 1982, for the method.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.contact.cone import Cone, nearest
+from diffrigid.contact.mobility import Mobility, bodies_inverse, relative_changes, twists
+from diffrigid.numerics import dot, norm
+from diffrigid.state import rotations
+
+ROUNDS = 40  # at most
+SOFTNESS = (
+    1e-2  # [-] 1 / (sigma k): what a round leaves of the error in P, and the stiffness that Newton's method meets
+)
+READY = 1e-2  # [-] of u: an error of the inner problem at which the multipliers are taken anew
+HALVINGS = 10  # of a step along its line
+
+
+def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error: Callable, enough: Array) -> Array:
+    """Impulses of the C contacts, (C, D, *batch) [N s].
+
+    Args:
+        error: of impulses, (*batch): that of the best is returned.
+        enough: (*batch) error at which to stop.
+    """
+    sigma = (1.0 / (SOFTNESS * cone.scale))[:, None]
+    D = v_rel.shape[1]
+
+    def pushed(P: Array, y: Array) -> tuple[Array, Array]:
+        y_t = y - jax.vmap(dot)(cone.normal, y)[:, None] * cone.normal
+        opening = cone.mu * jax.vmap(norm)(y_t) - cone.target
+        z = P - sigma * (y + opening[:, None] * cone.normal)
+        return nearest(cone, z), z
+
+    def relative(u: Array) -> Array:
+        by_body = u.reshape(-1, D + rotations(D).A, *u.shape[1:])
+        return relative_changes(arms, by_body[:, :D], by_body[:, D:])
+
+    def again(carry):
+        count, u, P, best, least = carry
+        y = v_rel + relative(u)
+        F, z = pushed(P, y)
+        new = error(F)
+        best, least = jnp.where((new < least)[None, None], F, best), jnp.minimum(new, least)
+        ready = _size(u - twists(F, arms, mobility), mobility, D) < READY * _size(u, mobility, D)
+        P = jnp.where(ready[None, None], F, P)
+        F, z = pushed(P, y)
+        off = u - twists(F, arms, mobility)
+        inverse = bodies_inverse(lambda dy: -jax.jvp(lambda y: pushed(P, y)[0], (y,), (dy,))[1], arms, mobility)
+        du = -(inverse * off[None]).sum(1)
+        dy, weight = relative(du), _momenta(du, mobility, D)
+
+        def ahead(share: Array) -> Array:  # slope of the convex function there
+            F = pushed(P, y + share * dy)[0]
+            return (weight * (u + share * du - twists(F, arms, mobility))).sum(0)
+
+        return count + 1, u + _down(ahead, jnp.ones_like(least)) * du, P, best, least
+
+    nothing = jnp.zeros_like(v_rel)
+    u, least = twists(nothing, arms, mobility), jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
+    busy = lambda carry: (carry[0] < ROUNDS) & jnp.any(carry[-1] > enough)  # noqa: E731
+    return lax.while_loop(busy, again, (0, u, nothing, nothing, least))[3]
+
+
+def _down(slope: Callable, whole: Array) -> Array:
+    """The share of a step, at most the whole, from which on a convex function would rise."""
+
+    def halved(_, ends):
+        low, high = ends
+        middle = 0.5 * (low + high)
+        over = slope(middle) > 0
+        return jnp.where(over, low, middle), jnp.where(over, middle, high)
+
+    over = slope(whole) > 0
+    search = lambda: lax.fori_loop(0, HALVINGS, halved, (jnp.zeros_like(whole), whole))[1]  # noqa: E731
+    return jnp.where(over, lax.cond(jnp.any(over), search, lambda: whole), whole)
+
+
+def _momenta(u: Array, mobility: Mobility, D: int) -> Array:
+    """M u of twists (R, *batch)."""
+    so, by_body = rotations(D), u.reshape(-1, D + rotations(D).A, *u.shape[1:])
+    inertia = jax.vmap(so.inverse_inertia)(mobility.inverse_inertia)
+    angular = jax.vmap(so.apply)(inertia, by_body[:, D:])
+    return jnp.concatenate([by_body[:, :D] / mobility.inverse_mass[:, None], angular], axis=1).reshape(u.shape)
+
+
+def _size(u: Array, mobility: Mobility, D: int) -> Array:
+    """Root of u M u, (*batch)."""
+    return jnp.sqrt(jnp.maximum((u * _momenta(u, mobility, D)).sum(0), 0.0))

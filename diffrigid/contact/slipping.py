@@ -1,0 +1,61 @@
+"""Where resting contacts and friction displace bodies within a step, apart from what their even force does."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid.contact.mobility import momentum_changes
+from diffrigid.contact.resting import Strikes
+from diffrigid.contact.sides import at_colliders, same_bodies
+from diffrigid.numerics import constant, dot, norm, rows, safe_divide
+from diffrigid.pytree import replace
+
+CREEP = 1e-6  # [m/s] of a slip that is none
+
+
+def keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array:
+    """Changes of L (N, A, *batch) that go with displacements P / m of two bodies of which one drifts from the other.
+
+    They move the angular momentum about the origin by P x (v_a - v_b): both bodies give back half of it.
+    """
+    jac = None if strikes.jac is None else jnp.zeros_like(strikes.jac)
+    return momentum_changes(replace(strikes, arm_a=drift, arm_b=-drift, jac=jac), P, moving)[1]
+
+
+def drift_after(strikes: Strikes, dv: Array) -> Array:
+    """Half the velocity of a against b after changes dv of the bodies (N, D, *batch), 0 at a static; (C, D, *batch)."""
+    both = constant(tuple(float(max(pair) < len(dv)) for pair in zip(strikes.a, strikes.b, strict=True)), str(dv.dtype))
+    change = 0.5 * (at_colliders(dv, strikes.a, 0.0) - at_colliders(dv, strikes.b, 0.0))
+    return strikes.drift + both.reshape(-1, *[1] * (dv.ndim - 1)) * change
+
+
+def stopping_early(strikes: Strikes, P: Array, law: tuple[Array, Array, Array | None], T: Array) -> Array:
+    """What the impulses P, taken as even over T, move too little where the slip stops before: (C, D, *batch) [N s^2].
+
+    Friction first stops the slip with all of its bound, then holds against the pull, evenly. Stopping takes the
+    part of P that goes with the slip at the beginning, with its centroid at half the time tau until the stop instead
+    of T / 2: so it moves the contact by a further (T - tau) / 2. Exact for one direction of slip under a constant pull.
+    """
+    n, together, (target, mu, most) = strikes.normal, same_bodies(strikes.a, strikes.b), law
+    of_joint = None if most is None else jnp.isfinite(most)  # it rubs along its coordinate
+
+    def in_all(values: Array) -> Array:  # over the contacts of the same two bodies, which slip as one
+        return rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), together).sum(1)
+
+    def rubbing(r: Array) -> Array:
+        r_t = r - jax.vmap(dot)(n, r)[:, None] * n
+        return r_t if of_joint is None else jnp.where(of_joint[:, None], r, r_t)
+
+    at_end, friction = rubbing(strikes.v_rel - target[:, None] * n), rubbing(P)
+    slip = at_end - T[:, None] * rubbing(strikes.pull)
+    speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
+    along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
+    bounds = mu * jax.vmap(dot)(n, P)
+    bounds = bounds if most is None else jnp.where(jnp.isfinite(most), most, bounds)
+    size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
+    whole = jnp.where(speed > CREEP, at_end_speed * bound + size * (speed - along), 0.0)
+    share = safe_divide(speed * size, whole)  # tau / T
+    stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0) & (speed > CREEP)
+    per_speed = safe_divide(own, jnp.where(stops, at_end_speed, 0.0))
+    lost = 0.5 * T * (1.0 - jnp.clip(share, 0.0, 1.0)) * per_speed
+    return jnp.where(stops[:, None], -lost[:, None] * slip, 0.0)

@@ -1,0 +1,158 @@
+"""Limits, friction and motors of joints, as rows beside the contacts: each acts along the coordinate of one joint.
+
+A limit is a contact in one dimension, with the gap coordinate - lower or upper - coordinate; it is struck at its time
+within the step. Friction, or a motor, acts at the end of every step with what brings the rate to `speed`, but no more
+than its bound. Their numbers stand in the first component of the vectors of a contact.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.ad_checkpoint import checkpoint_name
+
+from diffrigid.contact.resting import Strikes
+from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
+from diffrigid.joints import Pose
+from diffrigid.linkage import differentiated
+from diffrigid.numerics import FOUND, implicit_root, rows, unit_vector
+from diffrigid.pytree import replace
+from diffrigid.state import rotations
+
+SEARCH = 8  # steps of Newton's method, kept between the ends, for the time of a limit on a nearly straight line
+
+
+class Stop(NamedTuple):
+    """A row of each joint of a group."""
+
+    group: int
+    kind: str  # "lower", "upper" or "friction"
+
+
+def stops_of(world: Any) -> tuple[Stop, ...]:
+    """The rows of a world, for each group of joints one after the other."""
+    kinds = ("lower", "upper", "friction")
+    return tuple(Stop(k, kind) for k, g in enumerate(world.joints) for kind in kinds if _has(g, kind))
+
+
+def stop_ends(world: Any, side: str) -> tuple[int, ...]:
+    """Colliders of the rows; the world itself counts as the last."""
+    return tuple(end for stop in stops_of(world) for end in getattr(world.joints[stop.group], side))
+
+
+def is_drive(world: Any) -> tuple[bool, ...]:
+    """Of every row: friction or motor, not a limit."""
+    return tuple(stop.kind == "friction" for stop in stops_of(world) for _ in world.joints[stop.group].a)
+
+
+def of_stops(world: Any, field: str, kinds: tuple[str, ...], other: float, batch: tuple[int, ...]) -> Array:
+    """A number of the joints for every row of some kinds, and `other` for the rest, (R, *batch)."""
+    parts = []
+    for stop in stops_of(world):
+        group = world.joints[stop.group]
+        value = getattr(group, field) if stop.kind in kinds else None
+        parts.append(jnp.full((len(group.a), *batch), other) if value is None else value)
+    return jnp.concatenate([jnp.broadcast_to(part, part.shape[:1] + batch) for part in parts])
+
+
+def find_stops(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array) -> Strikes:
+    """Rows of every limit at the time when it is struck, or at the end of the step, and of every friction at the end.
+
+    Args:
+        at_end: bool; True: all at the end of the step.
+    """
+    padded, parts = _with_statics(world, flight), []
+    since = jnp.concatenate([since, jnp.broadcast_to(-dt, (len(world.static_names) + 1, *dt.shape))])
+    for stop in stops_of(world):
+        group = world.joints[stop.group]
+        sides = (jax.tree.map(lambda leaf, ends=ends: rows(leaf, ends), padded) for ends in (group.a, group.b))
+        latest = jnp.maximum(rows(since, group.a), rows(since, group.b))
+        row: Callable = partial(_row, stop.kind, dt, at_end)
+        parts.append(jax.vmap(row)(replace(group, a=None, b=None), *sides, latest))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def _row(kind: str, dt: Array, at_end: Array, joint: Any, a: Flight, b: Flight, since: Array) -> Strikes:
+    so, sign = rotations(a.dim), -1.0 if kind == "upper" else 1.0
+
+    def gap(s: Array) -> Array:
+        poses = (Pose(position(f, s), orientation(f, s)) for f in (a, b))
+        return sign * (joint.coordinate(so, *poses) - getattr(joint, kind))
+
+    if kind == "friction":
+        s, active = dt, jnp.broadcast_to(at_end, dt.shape)
+    else:
+        s, active = _struck(gap, since, jnp.maximum(a.t0, b.t0), dt, at_end)
+    poses: Any = [Pose(position(f, s), orientation(f, s)) for f in (a, b)]
+    inverses = [so.world_inverse(f.inverse_inertia, pose.q) for f, pose in zip((a, b), poses, strict=True)]
+    spins = [so.apply(i, angular_momentum(f, s)) for i, f in zip(inverses, (a, b), strict=True)]
+    twists = [jnp.concatenate([velocity(f, s), w]) for f, w in zip((a, b), spins, strict=True)]
+    along = sign * differentiated(so, lambda a, b: joint.coordinate(so, a, b)[None], *poses, *twists)[2][0]
+    jac = along.reshape(2, so.D + so.A, *dt.shape)
+    rate = (jac * jnp.stack(twists)).sum((0, 1))
+    bend = lax.stop_gradient(_second(gap, s))
+    mobile = [f.inverse_mass * (j[: so.D] ** 2).sum(0) for f, j in zip((a, b), jac, strict=True)]
+    mobile += [(j[so.D :] * so.apply(i, j[so.D :])).sum(0) for i, j in zip(inverses, jac, strict=True)]
+    first = unit_vector(jnp.zeros((so.D, *dt.shape), dt.dtype), 0)
+    none = jnp.zeros_like(first)
+    return Strikes(
+        active=active, s=s, gap=gap(s) if kind != "friction" else jnp.zeros_like(s), normal=first, arm_a=none,
+        arm_b=none, K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,
+        pull=bend[None] * first, drift=none,
+        jac=jac,
+    )  # fmt: skip
+
+
+def _struck(gap: Callable, since: Array, start: Array, dt: Array, at_end: Array) -> tuple[Array, Array]:
+    """When a limit is struck, (*batch) [s], and whether it is, or is touched where `at_end`.
+
+    On a path that goes back to `since`, before the step: so one that was missed there is still taken at its time. One
+    that is open at no time, and closes or rests at the start, is struck at once.
+    """
+    slack = jnp.sqrt(jnp.finfo(dt.dtype).eps)
+    free = lax.stop_gradient(gap(since)) > slack
+    inside = lax.stop_gradient(gap(dt)) < 0
+
+    def closer(_, ends):
+        low, high, s = ends
+        value, slope = jax.jvp(gap, (s,), (jnp.ones_like(s),))
+        low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
+        newton = s - value / jnp.where(slope != 0, slope, 1.0)
+        within = (newton >= low) & (newton <= high) & (slope != 0)
+        return low, high, jnp.where(within, newton, 0.5 * (low + high))
+
+    found = lax.fori_loop(0, SEARCH, closer, lax.stop_gradient((since, dt, 0.5 * (since + dt))))[2]
+    closing = jax.jvp(gap, (start,), (jnp.ones_like(start),))[1] <= slack
+    hit = inside & (free | closing) & ~at_end
+    s0 = checkpoint_name(lax.stop_gradient(jnp.where(hit & free, found, jnp.where(hit, start, dt))), FOUND)
+    value, slope = jax.jvp(gap, (s0,), (jnp.ones_like(s0),))
+    s = jnp.where(hit & free, implicit_root(s0, value, lax.stop_gradient(slope)), jnp.where(hit, start, dt))
+    return s, hit | (at_end & (value <= slack))
+
+
+def _second(gap: Callable, s: Array) -> Array:
+    """Second derivative by time."""
+    one = jnp.ones_like(s)
+    return jax.jvp(lambda s: jax.jvp(gap, (s,), (one,))[1], (s,), (one,))[1]
+
+
+def _with_statics(world: Any, flight: Flight) -> Flight:
+    """The flights of all colliders: bodies, then statics and the world, which do not move."""
+    count = len(world.static_names) + 1
+    world_q = jnp.zeros_like(flight.q[:1]).at[:, 0].set(1.0)
+    still = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), flight)
+    x, q = (
+        jnp.concatenate([jnp.broadcast_to(leaf, (len(leaf), *like.shape[1:])), last])
+        for leaf, like, last in (
+            (world.statics.x, flight.x, jnp.zeros_like(flight.x[:1])),
+            (world.statics.q, flight.q, world_q),
+        )
+    )
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), flight, replace(still, x=x, q=q))
+
+
+def _has(group: Any, kind: str) -> bool:
+    return getattr(group, kind, None) is not None

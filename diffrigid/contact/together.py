@@ -1,0 +1,213 @@
+"""Contacts that share a body, solved together: velocities that do not close, and impulses inside the friction cone.
+
+With y the relative velocities at the contacts after all impulses P, k > 0 any number for each contact, and `allowed`
+what Coulomb allows of an impulse,
+
+    P = allowed(z),   z = P - (y - target n) / k,   y = v_rel + W P,   W = J G J^T
+
+says at once that contacts do not pull, do not close, and slip only against all of their friction. It is solved by
+Newton's method with the derivative D of `allowed`. Sticking makes (1 - D) + D W / k singular where contacts repeat
+each other, as four corners on a floor do, so the method of multipliers is mixed in: D is taken (1 - e) D, with a
+small e. Then B = 1 - (1 - e) D has an inverse contact by contact, and with u = G J^T dP, the change of the twists of
+the bodies,
+
+    (1 + G J^T B^-1 D J / k) u = G J^T B^-1 r,    dP = B^-1 (r - D J u / k)
+
+so what is solved is as large as the bodies are many, and not the contacts.
+Source: Alart & Curnier, Computer Methods in Applied Mechanics and Engineering 92 (1991) 353, for the equation;
+Bertsekas, Constrained Optimization and Lagrange Multiplier Methods, 1982, for e.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.ad_checkpoint import checkpoint_name
+
+from diffrigid.contact.cone import Cone, allowed, split
+from diffrigid.contact.mobility import (
+    Arms,
+    Mobility,
+    bodies_inverse,
+    momentum_changes,
+    relative_changes,
+    twists,
+    velocities,
+)
+from diffrigid.contact.multipliers import solve_roughly
+from diffrigid.numerics import FOUND, dot, norm, safe_divide
+from diffrigid.pytree import array, pytree
+from diffrigid.state import rotations
+
+ROUNDS = 40  # at most, of Newton's method
+CIRCLES = 10  # rounds after which `solve_roughly` gives it another start
+PILE = 3  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
+SMOOTHING = 3  # rounds after each Newton step
+PATIENCE = 3  # rounds that do not lessen a small error: then it is rounding
+REFINEMENTS = 8  # of the linear system of the derivative
+
+
+@pytree
+class Slope:
+    """D, the derivative of `allowed` at z, contact by contact, as numbers and directions."""
+
+    on: Array = array("C")  # 1 where the contact pushes, else 0
+    slides: Array = array("C")  # 1 where it does at its bound of friction
+    turn: Array = array("C")  # [-] how far the direction of sliding follows z; 1 where it sticks
+    normal: Array = array("C", "D")
+    along: Array = array("C", "D")  # of the sliding
+    mu: Array = array("C")
+
+
+def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
+    """z, (C, D, *batch) [N s]."""
+    y = v_rel + _moved(P, arms, mobility)
+    return P - (y - cone.target[:, None] * cone.normal) / cone.scale[:, None]
+
+
+def _moved(P: Array, arms: Arms, mobility: Mobility) -> Array:
+    """W P: changes of the relative velocities, (C, D, *batch) [m/s]."""
+    dv, dw, _ = velocities(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
+    return relative_changes(arms, dv, dw)
+
+
+def _slope(cone: Cone, z: Array) -> Slope:
+    z_n, z_t = split(cone.normal, z)
+    size, bound = jax.vmap(norm)(z_t), cone.mu * jnp.maximum(z_n, 0.0)
+    follows = z_n > 0 if cone.most is None else jnp.where(jnp.isinf(cone.most), z_n > 0, jnp.abs(z_n) < cone.most)
+    on, slides = jnp.where(follows, cone.on, 0.0), (size >= bound).astype(z.dtype)
+    turn, along = jnp.where(size < bound, 1.0, safe_divide(bound, size)), z_t / jnp.where(size > 0, size, 1.0)[:, None]
+    return Slope(on=on, slides=slides, turn=turn, normal=cone.normal, along=along, mu=cone.mu)
+
+
+def _sloped(slope: Slope, r: Array) -> Array:
+    """D r, (C, D, *batch)."""
+    r_n, r_t = split(slope.normal, r)
+    along = slope.slides * (slope.mu * r_n - slope.turn * jax.vmap(dot)(slope.along, r_t))
+    return slope.on[:, None] * (r_n[:, None] * slope.normal + slope.turn[:, None] * r_t + along[:, None] * slope.along)
+
+
+def _unsloped(slope: Slope, e: float, r: Array) -> tuple[Array, Array]:
+    """B^-1 r and B^-1 D r, by components: normal, along the sliding, and across both."""
+    r_n, r_t = split(slope.normal, r)
+    r_along = slope.slides * jax.vmap(dot)(slope.along, r_t)
+    r_across = r_t - r_along[:, None] * slope.along
+    on, kept = slope.on, 1.0 - slope.on * (1.0 - e)
+    rest = 1.0 - on * (1.0 - e) * slope.turn  # e where it sticks
+    drag = slope.slides * slope.mu * r_n / kept * on
+    B_r = (r_n / kept)[:, None] * slope.normal + r_across / rest[:, None]
+    BD_r = (on * r_n / kept)[:, None] * slope.normal + (on * slope.turn / rest)[:, None] * r_across
+    return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
+
+
+def _small(dtype: Any) -> float:
+    """e: an error of relative size (rounding / e^2 + e / least eigenvalue of W / k) is left by each step."""
+    return float(jnp.finfo(dtype).eps) ** 0.4
+
+
+def _answer(slope: Slope, cone: Cone) -> Callable[[Array], Array]:
+    """B^-1 D / k: impulses for relative velocities, (C, D, *batch)."""
+    return lambda y: _unsloped(slope, _small(y.dtype), y)[1] / cone.scale[:, None]
+
+
+def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
+    """B^-1 D J / k of the twists (C, *batch) of all bodies: impulses, (C, D, *batch)."""
+    D = arms.arm_a.shape[1]
+    by_body = twist.reshape(-1, D + rotations(D).A, *twist.shape[1:])
+    return _answer(slope, cone)(relative_changes(arms, by_body[:, :D], by_body[:, D:]))
+
+
+def _newton_step(r: Array, inverse: Array, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
+    """dP of (B + D W / k) dP = r, (C, D, *batch)."""
+    direct = _unsloped(slope, _small(r.dtype), r)[0]
+    twist = (inverse * twists(direct, arms, mobility)[None]).sum(1)
+    return direct - _pushed_back(slope, cone, arms, twist)
+
+
+@jax.custom_jvp
+def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
+    """Impulses of all contacts that take part, (C, D, *batch) [N s]; zero for the others.
+
+    Args:
+        shared: bool: there is such a contact in some world of the batch.
+        v_rel: (C, D, *batch) [m/s] before the impulses.
+
+    After every Newton step P is brought back into the cones, and made smoother by some rounds in which each contact
+    takes a share of the masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
+    """
+    rounding = jnp.finfo(v_rel.dtype).eps
+    tolerance, least = 16.0 * rounding, rounding**0.6 * cone.rest_speed
+
+    def busy(carry):
+        count, _, best, error, since = carry
+        small = jnp.where(since < PATIENCE, tolerance, jnp.where(since < 5 * PATIENCE, 1e-3, jnp.inf))
+        return (count < ROUNDS) & jnp.any(error > small * speed(best) + least)
+
+    def speed(P):
+        return jnp.max(cone.scale[:, None] * jnp.abs(P), (0, 1))
+
+    def smoother(_, P):
+        z = _excess(cone, P, v_rel, arms, mobility)
+        return allowed(cone, P + (z - P) / cone.crowd[:, None])
+
+    def wrong(P):
+        return speed(allowed(cone, _excess(cone, P, v_rel, arms, mobility)) - P)
+
+    def roughly(P, since):
+        return solve_roughly(cone, v_rel, arms, mobility, wrong, least), jnp.zeros_like(since)
+
+    def again(carry):
+        count, P, best, error, since = carry
+        if mobility.inverse_mass.shape[0] >= PILE:
+            P, since = lax.cond(count == CIRCLES, roughly, lambda P, since: (P, since), P, since)
+        z = _excess(cone, P, v_rel, arms, mobility)
+        r = allowed(cone, z) - P
+        size = speed(r)
+        better = size < error
+        best, since = jnp.where(better[None, None], P, best), jnp.where(better, 0, since + 1)
+        slope = _slope(cone, z)
+        dP = _newton_step(r, bodies_inverse(_answer(slope, cone), arms, mobility), slope, cone, arms, mobility)
+        P = lax.fori_loop(0, SMOOTHING, smoother, allowed(cone, P + dP))
+        return count + 1, P, best, jnp.minimum(size, error), since
+
+    def iterate(nothing):
+        error = jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
+        start = (0, smoother(0, nothing), nothing, error, jnp.zeros_like(error, np.int32))
+        return lax.while_loop(busy, again, start)[2]
+
+    return lax.cond(shared, iterate, lambda nothing: nothing, jnp.zeros_like(v_rel))
+
+
+@solve_together.defjvp
+def _solve_together_jvp(primals, tangents):
+    """(1 - D + D W / k) dP = what the parameters change of `allowed(z)` at fixed P."""
+    shared, cone, v_rel, arms, mobility = primals
+    P = checkpoint_name(solve_together(*primals), FOUND)
+
+    def projected(cone, v_rel, arms, mobility):
+        return allowed(cone, _excess(cone, P, v_rel, arms, mobility))
+
+    moved = jax.jvp(projected, primals[1:], tangents[1:])[1]
+    slope = lax.stop_gradient(_slope(cone, _excess(cone, P, v_rel, arms, mobility)))
+    fixed = lax.stop_gradient((slope, cone, arms, mobility))
+
+    def linear(x):
+        return x - _sloped(slope, x - _moved(x, arms, mobility) / cone.scale[:, None])
+
+    def refined(matvec, b, transposed):
+        inverse = bodies_inverse(_answer(*fixed[:2]), *fixed[2:])
+
+        def step(r):
+            return _newton_step(r, inverse, *fixed)
+
+        approximate = (lambda r: jax.linear_transpose(step, b)(r)[0]) if transposed else step
+        return lax.fori_loop(0, REFINEMENTS, lambda _, x: x + approximate(b - matvec(x)), jnp.zeros_like(b))
+
+    def solve(matvec, b, transposed=False):
+        return lax.cond(shared, lambda b: refined(matvec, b, transposed), jnp.zeros_like, b)
+
+    return P, lax.custom_linear_solve(linear, moved, solve, transpose_solve=functools.partial(solve, transposed=True))

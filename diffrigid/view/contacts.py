@@ -1,0 +1,263 @@
+"""Where bodies of a trajectory touch, and with what impulses. NumPy.
+
+A trajectory stores states, not impulses, so they are inferred, one interval between two stored times after the other:
+
+    who touches    shapes that come together on their free flight from the start of the interval, or lie together
+                   through it; corner against side, and in 3D edge against edge, in the plane or space of the cores
+    impulses       the smallest that, at these points and in the joints, explain the changes of momentum and angular
+                   momentum beyond what the forces do in the interval (least norm: where points share a load, equally)
+
+Forces by `controls`, which a trajectory does not store, are taken for contact. Exact for a body with one contact.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from diffrigid.forces import total_wrench
+from diffrigid.hull import hull_faces
+from diffrigid.pytree import align, replace
+from diffrigid.shapes import HalfSpace, edges, radius, vertices
+from diffrigid.state import momentum, spin
+from diffrigid.step import Trajectory
+from diffrigid.view.touch import Side, gaps, rotated
+from diffrigid.world import World
+
+SLOP = 2e-3  # of the smaller size: what counts as touching
+WORK = 4_000_000  # pairs times intervals beyond which not all stored times are looked at
+ROUGH = 5.0  # an impulse that exceeds what the forces do in an interval by this factor is an impact
+
+
+class Touch(NamedTuple):
+    """Contacts of all intervals, in any order; M of them."""
+
+    interval: np.ndarray  # (M,)
+    s: np.ndarray  # (M,) [s] since the start of the interval
+    new: np.ndarray  # (M,) bool: apart at the start of the interval
+    a: np.ndarray  # (M,) colliders
+    b: np.ndarray
+    point: np.ndarray  # (M, D) [m]
+
+
+class Motion(NamedTuple):
+    """All colliders at the times looked at; those that do not move have no velocity."""
+
+    t: np.ndarray  # (T+1,) [s]
+    x: np.ndarray  # (T+1, N + S, D)
+    q: np.ndarray  # (T+1, N + S, Q)
+    v: np.ndarray  # (T+1, N + S, D)
+    w: np.ndarray  # (T+1, N + S, A)
+
+
+def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
+    """Rows by time: t [s], 1 for an impact or 0 for rest, point (D) [m], impulse (D) [N s] on one that moves.
+
+    Args:
+        t_drawn: (F,) [s] times that are drawn; resting contacts are given only for intervals that begin then.
+    """
+    world, dim = trajectory.world, trajectory.world.dim
+    some = _thinned(trajectory)
+    motion, (dp, dL, push) = _motion(some), _changes(some)
+    found = [_touches(world, group, motion, dp, dL, push) for group in world.pairs]
+    touch = Touch(*(np.concatenate(parts) for parts in zip(*found, strict=True))) if found else None
+    if touch is None or not len(touch.s):
+        return np.zeros((0, 2 + 2 * dim))
+    impulse = _impulses(world, motion, touch, dp, dL)
+    impulse = np.where(touch.a[:, None] < len(world.names), impulse, -impulse)
+    size, ends = np.linalg.norm(impulse, axis=1), np.stack([touch.a, touch.b], axis=1)
+    moved = np.concatenate([push, np.zeros((len(push), len(world.static_names)))], axis=1)
+    rough = size > ROUGH * moved[touch.interval[:, None], ends].max(1)
+    impact = touch.new | rough
+    drawn = np.isin(touch.interval, np.searchsorted(motion.t, t_drawn - 1e-9 * motion.t[-1]))
+    kept = (size > 1e-6 * size.max()) & (impact | drawn)
+    table = np.column_stack([motion.t[touch.interval] + touch.s, impact, touch.point, impulse])[kept]
+    return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def _thinned(trajectory: Trajectory) -> Trajectory:
+    pairs = sum(len(group.a) for group in trajectory.world.pairs)
+    every = 1 + pairs * len(trajectory.t) // WORK
+    t, state = jax.tree.map(lambda leaf: np.asarray(leaf, float)[::every], (trajectory.t, trajectory.state))
+    return replace(trajectory, t=t, state=state)
+
+
+def _motion(trajectory: Trajectory) -> Motion:
+    state, still = trajectory.state, trajectory.world.statics
+    count, steps = len(trajectory.world.static_names), len(trajectory.t)
+
+    def joined(moving, rest):
+        return np.concatenate([moving, np.broadcast_to(rest, (steps, count, moving.shape[2]))], axis=1)
+
+    x, q = (joined(*both) for both in ((state.x, np.asarray(still.x, float)), (state.q, np.asarray(still.q, float))))
+    return Motion(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0))
+
+
+def _changes(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """By interval and body: change of momentum (T, N, D) and of angular momentum (T, N, A) beyond that of the forces,
+    and the size of what the forces did, (T, N), all [N s]."""
+    dtype = trajectory.world.bodies.mass.dtype
+    state = jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1).astype(dtype), trajectory.state)
+    bodies, h = align(trajectory.world.bodies, 1), np.diff(trajectory.t)[:, None, None]
+    forces = tuple(replace(f, control=None) if getattr(f, "control", None) else f for f in trajectory.world.forces)
+    wrench = total_wrench(align(forces, 1), bodies, state, None)
+    p, L = (np.moveaxis(np.asarray(leaf, float), -1, 0) for leaf in (momentum(bodies, state), spin(bodies, state)))
+
+    def added(force, like):
+        if force is None:
+            return np.zeros_like(like[1:])
+        force = np.moveaxis(np.broadcast_to(np.asarray(force, float), (*like.shape[1:], len(like))), -1, 0)
+        return h * (force[1:] + force[:-1]) / 2
+
+    F = added(wrench.F, p)
+    return np.diff(p, axis=0) - F, np.diff(L, axis=0) - added(wrench.tau, L), np.linalg.norm(F, axis=2)
+
+
+def _touches(world: World, group: Any, motion: Motion, dp: np.ndarray, dL: np.ndarray, push: np.ndarray) -> Touch:
+    """Contacts of all pairs of one kind."""
+    sides = _side(world, group.shape_a), _side(world, group.shape_b)
+    a, b, rows = np.array(group.a), np.array(group.b), (np.array(group.row_a), np.array(group.row_b))
+    h, size = np.diff(motion.t), np.minimum(sides[0].size[rows[0]], sides[1].size[rows[1]])
+    struck = np.linalg.norm(dp, axis=2) + np.linalg.norm(dL, axis=2) / max(size.min(), 1e-9) > 1e-5 * (push + 1e-9)
+    struck = np.concatenate([struck, np.zeros((len(struck), len(world.static_names)), bool)], axis=1)
+    apart = np.linalg.norm(motion.x[:-1, a] - motion.x[:-1, b], axis=2)
+    path = h[:, None] * np.linalg.norm(motion.v[:-1, a] - motion.v[:-1, b], axis=2)
+    reach = 1.1 * (sides[0].size[rows[0]] + sides[1].size[rows[1]]) + 1.5 * path
+    k, pair = np.nonzero((struck[:, a] | struck[:, b]) & (apart < reach))
+    slop, row_a, row_b = SLOP * size[pair], rows[0][pair], rows[1][pair]
+
+    def at(s, chosen=slice(None)):
+        """Gaps (M, C) and points (M, C, D) when the bodies have flown freely for s (M,)."""
+        poses = [_flown(motion, k[chosen], body[pair[chosen]], s) for body in (a, b)]
+        return gaps(sides[0].take(row_a[chosen]), poses[0], sides[1].take(row_b[chosen]), poses[1])
+
+    start, _ = at(np.zeros(len(k)))
+    end, _ = at(h[k])
+    new, meets = start.min(1, initial=np.inf) > slop, end.min(1, initial=np.inf) <= slop
+    s = _meeting(at, h[k], new & meets)
+    gap, point = at(s)
+    near = (gap <= (2 * slop + 1e-2 * size[pair] * new)[:, None]) & (
+        gap <= gap.min(1, keepdims=True, initial=np.inf) + 4 * slop[:, None]
+    )
+    near &= meets[:, None] & (new[:, None] | (end <= slop[:, None]))
+    near &= ~_repeated(point, near, 10 * slop)
+    row, c = np.nonzero(near)
+    return Touch(k[row], s[row], new[row], a[pair[row]], b[pair[row]], point[row, c])
+
+
+def _side(world: World, group: int) -> Side:
+    """Corners, edges and faces of the rows of one entry of `world.shapes`, from the centres of their bodies."""
+    records, offset, dim = world.shapes[group], world.offsets[group], world.dim
+    shapes = [
+        jax.tree.map(lambda leaf, row=row: np.asarray(leaf)[row], records) for row in range(len(world.owners[group]))
+    ]
+    if isinstance(records, HalfSpace):
+        normal = np.asarray(records.normal, float)
+        return Side(None, normal, np.asarray(records.offset, float), (), (), np.full(len(normal), np.inf))
+    corners = np.array([vertices(shape, dim) for shape in shapes], float)
+    corners = corners if offset is None else corners + np.asarray(offset.r, float)[:, None]
+    rounding = np.array([radius(shape) for shape in shapes], float)
+    count = corners.shape[1]
+    if dim == 2:
+        sides = tuple((i, (i + 1) % count) for i in range(count if count > 2 else 1))
+        faces: tuple = ()
+    else:
+        sides = edges(shapes[0], dim) or ((0, 0),)
+        faces = tuple(hull_faces(corners[0])) if count > 3 else ()
+    return Side(corners, None, rounding, sides, faces, np.linalg.norm(corners, axis=2).max(1) + rounding)
+
+
+def _flown(motion: Motion, k: np.ndarray, body: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (M, D), (M, Q) after a free flight of s (M,) without forces, which is near enough within an interval."""
+    x, q, w = motion.x[k, body] + s[:, None] * motion.v[k, body], motion.q[k, body], s[:, None] * motion.w[k, body]
+    if q.shape[1] == 2:
+        c, u = np.cos(w[:, 0]), np.sin(w[:, 0])
+        return x, np.stack([c * q[:, 0] - u * q[:, 1], u * q[:, 0] + c * q[:, 1]], axis=1)
+    half = 0.5 * np.linalg.norm(w, axis=1, keepdims=True)
+    p0, p = np.cos(half), 0.5 * w * np.sinc(half / np.pi)
+    first = p0 * q[:, :1] - (p * q[:, 1:]).sum(1, keepdims=True)
+    return x, np.concatenate([first, p0 * q[:, 1:] + q[:, :1] * p + np.cross(p, q[:, 1:])], axis=1)
+
+
+def _meeting(at, h: np.ndarray, flying: np.ndarray) -> np.ndarray:
+    """Times (M,) when the least gap becomes zero, by bisection; 0 for those that lie together."""
+    s, chosen = np.zeros(len(h)), np.flatnonzero(flying)
+    low, high = np.zeros(len(chosen)), h[chosen].copy()
+    for _ in range(14 if len(chosen) else 0):
+        middle = (low + high) / 2
+        closed = at(middle, chosen)[0].min(1) <= 0
+        low, high = np.where(closed, low, middle), np.where(closed, middle, high)
+    s[chosen] = high
+    return s
+
+
+def _repeated(point: np.ndarray, near: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Candidates (M, C) that lie where an earlier one of the same pair does."""
+    repeated, several = np.zeros_like(near), np.flatnonzero(near.sum(1) > 1)
+    for row in several:
+        chosen = np.flatnonzero(near[row])
+        places = point[row, chosen]
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+        repeated[row, chosen] = np.tril(apart < distance[row], -1).any(1)
+    return repeated
+
+
+def _impulses(world: World, motion: Motion, touch: Touch, dp: np.ndarray, dL: np.ndarray) -> np.ndarray:
+    """Impulses (M, D) [N s] on collider a (b receives the opposite), the least that explain the changes of momentum."""
+    found, moving = np.zeros_like(touch.point), len(world.names)
+    change, order = np.concatenate([dp, dL], axis=2), np.argsort(touch.interval, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(touch.interval[order])) + 1):
+        k, s = touch.interval[rows[0]], touch.s[rows]
+        ends = np.stack([touch.a[rows], touch.b[rows]])
+        arms = touch.point[rows] - motion.x[k][ends] - s[:, None] * motion.v[k][ends]
+        joints = [_anchors(world, motion, k, group) for group in world.joints]
+        all_ends, all_arms = (np.concatenate(parts, axis=1) for parts in zip((ends, arms), *joints, strict=True))
+        label = _islands(all_ends, moving)
+        island = label[all_ends.min(0)]  # statics have the larger numbers
+        for number in np.unique(island[: rows.size]):
+            bodies, chosen = np.flatnonzero(label == number), np.flatnonzero(island == number)
+            within = np.searchsorted(bodies, all_ends[:, chosen])
+            within = np.where(all_ends[:, chosen] < moving, within, len(bodies))
+            A = _columns(within, all_arms[:, chosen], len(bodies), motion.w.shape[2])
+            normal = A @ A.T
+            lam = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), change[k, bodies].ravel())
+            contacts = chosen[chosen < rows.size]
+            found[rows[contacts]] = (A.T @ lam).reshape(len(chosen), -1)[: len(contacts)]
+    return found
+
+
+def _islands(ends: np.ndarray, moving: int) -> np.ndarray:
+    """For each of the moving bodies the least number of those it hangs together with, through `ends` (2, C)."""
+    label, (a, b) = np.arange(moving), ends[:, (ends < moving).all(0)]
+    while (label[a] != label[b]).any():
+        least = np.minimum(label[a], label[b])
+        np.minimum.at(label, a, least)
+        np.minimum.at(label, b, least)
+    return label
+
+
+def _columns(ends: np.ndarray, arms: np.ndarray, moving: int, A: int) -> np.ndarray:
+    """Momenta and angular momenta of all bodies, (N (D + A), C D), by unit impulses at C points on the bodies
+    ends (2, C), arms (2, C, D) from their centres: + on the first, - on the second."""
+    count, dim = arms.shape[1:]
+    made = np.zeros((moving, dim + A, count, dim))
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        for c, body in enumerate(ends[side]):
+            if body < moving:
+                made[body, :dim, c] += sign * np.eye(dim)
+                made[body, dim:, c] += sign * _moments(arms[side, c])
+    return made.reshape(moving * (dim + A), count * dim)
+
+
+def _moments(r: np.ndarray) -> np.ndarray:
+    """Moments (A, D) of the unit impulses along the axes at r (D,)."""
+    return np.array([[-r[1], r[0]]]) if len(r) == 2 else np.cross(r, np.eye(3)).T
+
+
+def _anchors(world: World, motion: Motion, k: int, group: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Bodies (2, J) of the joints of one kind, and arms (2, J, D) [m] from their centres to the anchors."""
+    a, anchor = np.array(group.a), np.asarray(group.anchor_a, float)
+    arm_a = rotated(motion.q[k, a], anchor)
+    b = np.array([len(world.names) + len(world.static_names) if end is None else end for end in group.b])
+    x = np.concatenate([motion.x[k], np.zeros((1, world.dim))])
+    return np.stack([a, b]), np.stack([arm_a, motion.x[k, a] + arm_a - x[b]])

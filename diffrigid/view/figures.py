@@ -1,0 +1,140 @@
+"""Pictures for papers, with matplotlib: each draws into `ax`, or new axes, and returns them; and a film of a motion.
+
+view.strobe(trajectory).figure.savefig("motion.pdf")
+"""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffrigid import state as of_state
+from diffrigid.pytree import align
+from diffrigid.step import Trajectory
+from diffrigid.view.frames import checked, energies
+from diffrigid.view.outline import outline
+from diffrigid.view.touch import rotated
+
+
+def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
+    """Outlines of all bodies at evenly spaced stored times, the later the darker, and their paths [m]. 2D."""
+    world, ax = checked(trajectory).world, _axes(ax)
+    if world.dim != 2:
+        raise ValueError("strobe draws 2D motions: for 3D use play, or plot components of state.x")
+    x, q, shapes = *_poses(trajectory), _outlines(world)
+    rows = np.unique(np.rint(np.linspace(0, len(x) - 1, pictures)).astype(int))
+    for owner, lines in shapes:
+        for n in rows if owner < len(world.names) else ():
+            shade = 0.25 + 0.75 * n / max(rows[-1], 1)
+            ax.plot(*(x[n, owner] + rotated(q[n, owner], lines)).T, color=f"C{owner}", alpha=shade, linewidth=1.2)
+    for body, name in enumerate(world.names):
+        ax.plot(*x[:, body].T, color=f"C{body}", linewidth=0.6, label=name)
+    _stage(ax, world, x, shapes)
+    return _labelled(ax, "x [m]", "y [m]")
+
+
+def film(trajectory: Trajectory, path: str | Path, speed: float = 1.0, rate: int = 30) -> Path:
+    """Write a 2D motion as .gif, or as .mp4 if ffmpeg is there, at so many pictures a second; 1 is real time."""
+    world, ax, path = checked(trajectory).world, _axes(None), Path(path)
+    if world.dim != 2:
+        raise ValueError("film draws 2D motions: for 3D use play")
+    from matplotlib import animation, pyplot
+
+    kinds: dict[str, Any] = {".gif": animation.PillowWriter, ".mp4": animation.FFMpegWriter}
+    if path.suffix not in kinds or not kinds[path.suffix].isAvailable():
+        raise ValueError(f"film: cannot write {path.name!r}: use .gif, which needs pillow, or .mp4, which needs ffmpeg")
+    x, q, shapes, t = *_poses(trajectory), _outlines(world), np.asarray(trajectory.t, float)
+    _stage(ax, world, x, shapes)
+    moving = [(owner, lines) for owner, lines in shapes if owner < len(world.names)]
+    curves = [ax.plot([], [], color=f"C{owner}")[0] for owner, _ in moving]
+    writer = kinds[path.suffix](fps=rate)
+    with writer.saving(ax.figure, path, dpi=100):
+        for now in np.arange(t[0], t[-1] + 1e-9, speed / rate):
+            n = int(np.abs(t - now).argmin())
+            for (owner, lines), curve in zip(moving, curves, strict=True):
+                curve.set_data(*(x[n, owner] + rotated(q[n, owner], lines)).T)
+            writer.grab_frame()
+    pyplot.close(ax.figure)
+    return path
+
+
+def energy(trajectory: Trajectory, ax: Any = None) -> Any:
+    """Kinetic, potential (gravity and springs) and total energy [J] of all bodies over time."""
+    world, ax, t = checked(trajectory).world, _axes(ax), np.asarray(trajectory.t)
+    for column, name in zip(energies(world, trajectory.state).T, ("kinetic", "potential", "total"), strict=True):
+        ax.plot(t, column, label=name, color="k" if name == "total" else None)
+    return _labelled(ax, "time [s]", "energy [J]")
+
+
+def momentum(trajectory: Trajectory, angular: bool = False, ax: Any = None) -> Any:
+    """Components of the momentum of all bodies [N s] over time, or of the angular one about the origin [N m s]."""
+    world, ax, t = checked(trajectory).world, _axes(ax), np.asarray(trajectory.t)
+    last = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), 0, -1), trajectory.state)
+    of = of_state.angular_momentum if angular else of_state.momentum
+    total = np.asarray(of(align(world.bodies, 1), last)).sum(0)
+    for column, name in zip(total, "xyz" if len(total) > 1 else "z", strict=False):
+        ax.plot(t, column, label=name)
+    return _labelled(ax, "time [s]", "angular momentum [N m s]" if angular else "momentum [N s]")
+
+
+def phase(trajectory: Trajectory, body: str, axis: str = "x", ax: Any = None) -> Any:
+    """Velocity [m/s] against position [m] of a body along an axis, or angular velocity against "angle" (2D)."""
+    world, ax, state = checked(trajectory).world, _axes(ax), trajectory.state
+    names = ["x", "y", "angle"] if world.dim == 2 else ["x", "y", "z"]
+    if body not in world.names or axis not in names:
+        raise ValueError(f"phase: no {axis!r} of {body!r}: bodies are {world.names}, axes {names}")
+    k, row = world.names.index(body), names.index(axis)
+    if axis == "angle":
+        q = np.asarray(state.q)[:, k]
+        ax.plot(np.unwrap(np.arctan2(q[:, 1], q[:, 0])), np.asarray(state.w)[:, k, 0], label=body)
+        return _labelled(ax, "angle [rad]", "angular velocity [rad/s]")
+    ax.plot(np.asarray(state.x)[:, k, row], np.asarray(state.v)[:, k, row], label=body)
+    return _labelled(ax, f"{axis} [m]", f"v_{axis} [m/s]")
+
+
+def _poses(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(trajectory.state.x, float), np.asarray(trajectory.state.q, float)
+
+
+def _outlines(world: Any) -> list[tuple[int, np.ndarray]]:
+    """Collider and closed outline (P, 2) [m], about its centre, of every shape."""
+    found = []
+    for group, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
+        for row, owner in enumerate(owners):
+            lines = outline(jax.tree.map(lambda leaf, row=row: np.asarray(leaf)[row], group), 2)
+            found.append((owner, lines if offset is None else lines + np.asarray(offset.r[row])))
+    return found
+
+
+def _stage(ax: Any, world: Any, x: np.ndarray, shapes: list) -> None:
+    """What does not move, and limits that hold the whole motion."""
+    moving, pad = len(world.names), 0.0
+    for owner, lines in shapes:
+        if owner < moving:
+            pad = max(pad, 1.1 * float(np.linalg.norm(lines, axis=1).max()))
+            continue
+        still_x, still_q = (np.asarray(leaf, float)[owner - moving] for leaf in (world.statics.x, world.statics.q))
+        ax.plot(*(still_x + rotated(still_q, lines)).T, color="0.4", linewidth=1.2)
+    low, high = np.nanmin(x, axis=(0, 1)) - pad, np.nanmax(x, axis=(0, 1)) + pad
+    pad = 0.05 * float((high - low).max())
+    ax.set_xlim(low[0] - pad, high[0] + pad)
+    ax.set_ylim(low[1] - pad, high[1] + pad)
+    ax.set_aspect("equal")
+
+
+def _axes(ax: Any) -> Any:
+    if ax is not None:
+        return ax
+    try:
+        from matplotlib import pyplot
+    except ImportError:
+        raise ImportError('figures need matplotlib: pip install "diffrigid[notebook]"') from None
+    return pyplot.subplots()[1]
+
+
+def _labelled(ax: Any, across: str, up: str) -> Any:
+    ax.set_xlabel(across)
+    ax.set_ylabel(up)
+    ax.legend(frameon=False)
+    return ax

@@ -1,0 +1,221 @@
+"""What a player draws, as plain data for JSON: times, poses, shapes, joints, energies, measured columns. NumPy.
+
+Columns of numbers are packed as 16-bit integers, see `pack`. Colliders are numbered as in `World`: bodies, then
+statics; the world itself comes last.
+"""
+
+import base64
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffrigid.forces import Gravity, SpringDamper
+from diffrigid.joints import Distance
+from diffrigid.pytree import align, batch_rank
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Shape, Sphere, with_topology
+from diffrigid.state import State, kinetic_energy
+from diffrigid.step import Trajectory
+from diffrigid.sysid.residuals import Column, columns
+from diffrigid.view.contacts import find_contacts
+from diffrigid.view.touch import rotated
+from diffrigid.world import World
+
+LEVELS = 65534  # of a packed number; 65535 is NaN
+
+
+def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
+    """The trajectory, if it is one of a single world with known values.
+
+    Raises:
+        ValueError: something else, traced, or a batch.
+    """
+    if not isinstance(trajectory, Trajectory):
+        raise ValueError(f"{name} is a {type(trajectory).__name__}: expected what `rollout` returns, or a dict of them")
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trajectory)):
+        raise ValueError(f"{name} is traced by jit, vmap or grad: draw it outside, from the result")
+    if np.ndim(trajectory.t) != 1:
+        raise ValueError(
+            f"{name}.t has shape {np.shape(trajectory.t)}, a batch in front: "
+            f"pick one with jax.tree.map(lambda leaf: leaf[0], {name})"
+        )
+    if np.ndim(trajectory.state.x) != 3 or batch_rank(trajectory.world):
+        raise ValueError(
+            f"{name}.state.x has shape {np.shape(trajectory.state.x)}, expected (T+1, N, D), and {name}.world without "
+            f"a batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[..., 0], {name}.state)), "
+            "and likewise in the leaves of the world that have the batch axis"
+        )
+    return trajectory
+
+
+def pack(table: np.ndarray) -> dict[str, Any]:
+    """Columns of a table (T, K) as 16-bit integers in base64, column after column: low + step * integer.
+
+    Each is rounded by at most half a step, 1/131068 of what the column spans. NaN is kept.
+    """
+    table = np.where(np.isfinite(table), table, np.nan)
+    known = np.isfinite(table)
+    low = np.where(known, table, np.inf).min(0, initial=np.inf)
+    low = np.where(np.isfinite(low), low, 0.0)
+    high = np.where(known, table, low).max(0, initial=-np.inf)
+    step = np.array([float(f"{s:.9g}") for s in np.maximum(high - low, 0.0) / LEVELS])
+    levels = np.rint((table - low) / np.where(step > 0, step, 1.0))
+    whole = np.where(known, np.clip(np.nan_to_num(levels), 0, LEVELS), LEVELS + 1).astype("<u2")
+    data = base64.b64encode(whole.T.tobytes()).decode()
+    return {"low": [float(f"{v:.10g}") for v in low], "step": step.tolist(), "rows": len(table), "data": data}
+
+
+def times(t: np.ndarray) -> Any:
+    """Times [s]: the first, the last and the number of equal steps; else all, as doubles in base64."""
+    even = np.linspace(t[0], t[-1], len(t))
+    if np.allclose(t, even, rtol=0, atol=1e-6 * (t[-1] - t[0]) / len(t)):
+        return [t[0], t[-1], len(t) - 1]
+    return base64.b64encode(t.astype("<f8").tobytes()).decode()
+
+
+def record(trajectory: Trajectory, name: str, data: Mapping[str, Any] | None, frames: int) -> dict[str, Any]:
+    """All that is drawn of one trajectory, at no more than `frames` of its times."""
+    world, t = trajectory.world, np.asarray(trajectory.t, float)
+    kept = np.unique(np.rint(np.linspace(0, len(t) - 1, min(len(t), frames))).astype(int))
+    some = jax.tree.map(lambda leaf: np.asarray(leaf, float)[kept], trajectory.state)
+    table, marks = poses(trajectory)[kept], find_contacts(trajectory, t[kept])
+    return {
+        "name": name,
+        "bodies": list(world.names),
+        "t": times(t[kept]),
+        "poses": pack(table),
+        "statics": np.round(np.concatenate([world.statics.x, world.statics.q], axis=1), 7).tolist(),
+        "shapes": shapes(world),
+        "joints": links(world),
+        "energy": pack(energies(world, some)),
+        "contacts": pack(marks),
+        "measured": None if data is None else measured(world, data, t[kept], table),
+    }
+
+
+def poses(trajectory: Trajectory) -> np.ndarray:
+    """Columns of every body, in 2D x, y, angle, vx, vy, in 3D x, y, z, q (4), v (3); [m], [rad], [m/s]."""
+    x, q, v, w = (np.asarray(getattr(trajectory.state, name), float) for name in "xqvw")
+    turn = _turns(np.asarray(trajectory.t, float), q, w) if x.shape[2] == 2 else _near(q)
+    return np.concatenate([x, turn, v], axis=2).reshape(len(x), -1)
+
+
+def _turns(t: np.ndarray, q: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Angles (T, N, 1), with as many turns as the angular velocities say, however fast."""
+    angle = np.arctan2(q[:, :, 1:], q[:, :, :1])
+    expected = np.diff(t)[:, None, None] * (w[1:] + w[:-1]) / 2
+    away = np.diff(angle, axis=0) - expected
+    steps = expected + away - 2 * np.pi * np.round(away / (2 * np.pi))
+    return np.concatenate([angle[:1], angle[:1] + np.cumsum(steps, axis=0)])
+
+
+def _near(q: np.ndarray) -> np.ndarray:
+    """Quaternions (T, N, 4), each with the sign that is nearer to the one before."""
+    dots = (q[1:] * q[:-1]).sum(2, keepdims=True)
+    signs = np.cumprod(np.where(dots < 0, -1.0, 1.0), axis=0)
+    return np.concatenate([q[:1], signs * q[1:]])
+
+
+def shapes(world: World) -> list[dict[str, Any]]:
+    """Kind, collider and dimensions of every shape, and where its origin sits on the body."""
+    found = []
+    for group, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
+        for row, owner in enumerate(owners):
+            shape = jax.tree.map(lambda leaf, row=row: leaf[row], group)
+            at = [0.0] * world.dim if offset is None else _short(offset.r[row])
+            found.append({"body": owner, "at": at} | _kind(shape))
+    return found
+
+
+def _kind(shape: Shape) -> dict[str, Any]:
+    match shape:
+        case Disc() | Sphere():
+            return {"kind": "ball", "radius": _short(shape.radius)}
+        case Capsule():
+            return {"kind": "capsule", "radius": _short(shape.radius), "half": _short(shape.half_length)}
+        case Box():
+            return {"kind": "box", "half": _short(shape.half)}
+        case HalfSpace():
+            return {"kind": "plane", "normal": _short(shape.normal), "offset": _short(shape.offset)}
+    solid: Any = with_topology(shape)
+    faces = {"faces": [list(face) for face in solid.faces]} if len(shape.vertices[0]) == 3 else {}
+    return {"kind": "hull", "points": _short(shape.vertices)} | faces
+
+
+def links(world: World) -> list[dict[str, Any]]:
+    """Joints and springs: two colliders and a point on each, body axes [m]."""
+    last, found = len(world.names) + len(world.static_names), []
+    for group in world.joints:
+        kind = "rod" if isinstance(group, Distance) else type(group).__name__.lower()
+        for row, (a, b) in enumerate(zip(group.a, group.b, strict=True)):
+            ends = _short(group.anchor_a[row]), _short(group.anchor_b[row])
+            found.append({"kind": kind, "ends": [[a, ends[0]], [last if b is None else b, ends[1]]]})
+    for force in world.forces:
+        if isinstance(force, SpringDamper):
+            a, b = ((last if body is None else body) for body in (force.a, force.b))
+            ends = _short(force.anchor_a), _short(force.anchor_b)
+            found.append({"kind": "spring", "ends": [[a, ends[0]], [b, ends[1]]]})
+    return found
+
+
+def energies(world: World, state: State) -> np.ndarray:
+    """Columns [J]: kinetic, potential (gravity, and springs), their sum; of states with a leading time axis."""
+    last = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), 0, -1), state)
+    kinetic = np.asarray(kinetic_energy(align(world.bodies, 1), last), float).sum(0)
+    x, mass = np.asarray(state.x, float), np.asarray(world.bodies.mass, float)
+    potential = np.zeros(len(x))
+    for force in world.forces:
+        if isinstance(force, Gravity):
+            potential -= (mass[:, None] * x @ np.asarray(force.g, float)[:, None]).sum((1, 2))
+        elif isinstance(force, SpringDamper):
+            ends = [_point(x, np.asarray(state.q, float), *end) for end in _ends(force)]
+            stretch = np.linalg.norm(ends[0] - ends[1], axis=1) - float(force.length)
+            potential += 0.5 * float(force.stiffness) * stretch**2
+    return np.stack([kinetic, potential, kinetic + potential], axis=1)
+
+
+def _ends(spring: SpringDamper):
+    return (spring.a, np.asarray(spring.anchor_a, float)), (spring.b, np.asarray(spring.anchor_b, float))
+
+
+def _point(x, q, body, anchor):
+    """World positions (T, D) of an anchor on a body, or of a world point."""
+    return np.broadcast_to(anchor, x[:, 0].shape) if body is None else x[:, body] + rotated(q[:, body], anchor)
+
+
+def measured(world: World, data: Mapping[str, Any], t_drawn: np.ndarray, drawn: np.ndarray) -> dict[str, Any]:
+    """Columns of a record, checked as `fit` does: poses like those of `poses` where they are known, else NaN.
+
+    Angles are those of the turn that is nearest to what is drawn, `drawn` (T, K) at t_drawn (T,) [s].
+    """
+    t, found = columns(world, data)
+    table = np.full((len(t), len(world.names), 5 if world.dim == 2 else 10), np.nan)
+    for column in found:
+        for place, values in _places(column, world.dim):
+            table[:, column.row, place] = values
+    if world.dim == 2:
+        for row, angle in enumerate(table[:, :, 2].T):
+            away = np.interp(t, t_drawn, drawn[:, 5 * row + 2]) - angle
+            table[:, row, 2] += 2 * np.pi * np.round(away / (2 * np.pi))
+    used = sorted({column.row for column in found})
+    return {"t": times(t), "bodies": used, "poses": pack(table[:, used].reshape(len(t), -1))}
+
+
+def _places(column: Column, dim: int):
+    """Where a column goes in the table of poses; angular velocities are not drawn."""
+    values, turn = column.measured, 1 if dim == 2 else 4
+    if column.field == "x":
+        yield slice(0, dim), values
+    elif column.field == "v":
+        yield slice(dim + turn, None), values
+    elif column.field == "angle":
+        yield slice(dim, dim + 1), values
+    elif column.field == "q":
+        yield slice(dim, dim + turn), np.arctan2(values[:, 1:], values[:, :1]) if dim == 2 else values
+
+
+def _short(leaf: Any) -> Any:
+    """Numbers or nested lists with 7 digits."""
+    array = np.asarray(leaf, float)
+    return float(f"{array:.7g}") if array.ndim == 0 else [_short(row) for row in array]

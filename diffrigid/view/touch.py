@@ -1,0 +1,124 @@
+"""Gaps between the parts of two convex shapes, for many poses at once. NumPy.
+
+A shape is the hull of its corners, rounded. Its parts are corners, sides (in 3D edges; of a disc or sphere one, without
+length), and in 3D faces.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Side(NamedTuple):
+    """R shapes of one kind, in body axes from the centres of their bodies; a half space has no corners."""
+
+    corners: np.ndarray | None  # (R, V, D) [m]
+    normal: np.ndarray | None  # (R, D) of a half space
+    rounding: np.ndarray  # (R,) [m]; of a half space its offset
+    sides: tuple  # pairs of corners
+    faces: tuple  # triples of corners, counter-clockwise from outside
+    size: np.ndarray  # (R,) [m] radius that holds it
+
+    def take(self, rows: np.ndarray) -> "Side":
+        """Those of some rows."""
+        return self._replace(
+            corners=None if self.corners is None else self.corners[rows],
+            normal=None if self.normal is None else self.normal[rows],
+            rounding=self.rounding[rows], size=self.size[rows],
+        )  # fmt: skip
+
+
+Pose = tuple[np.ndarray, np.ndarray]
+
+
+def gaps(a: Side, pose_a: Pose, b: Side, pose_b: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Signed gaps (M, C) [m] and points (M, C, D) of C candidates for a contact, M poses."""
+    if a.corners is None:
+        return gaps(b, pose_b, a, pose_a)
+    corners_a = placed(a.corners, pose_a)
+    if b.corners is None:
+        return _on_plane(a, corners_a, b, pose_b)
+    corners_b = placed(b.corners, pose_b)
+    if a.corners.shape[2] == 2:
+        found = [(b, _on_sides(corners_a, corners_b, b.sides)), (a, _on_sides(corners_b, corners_a, a.sides))]
+    else:
+        found = [(b, _crossing(corners_a, a.sides, corners_b, b.sides))]
+        found += [(b, _on_faces(corners_a, corners_b, b.faces))] if b.faces else []
+        found += [(a, _on_faces(corners_b, corners_a, a.faces))] if a.faces else []
+    rounding, parts = (a.rounding + b.rounding)[:, None], []
+    for owner, (gap, foot, top) in found:
+        share = np.minimum(owner.rounding[:, None] / np.maximum(np.abs(gap), 1e-12), 1.0)
+        parts.append((gap - rounding, foot + share[..., None] * (top - foot)))
+    gap, point = (np.concatenate(both, axis=1) for both in zip(*parts, strict=True))
+    return gap, point
+
+
+def placed(points: np.ndarray, pose: Pose) -> np.ndarray:
+    """Points (M, V, D) of bodies at poses (M, D), (M, Q), in the world."""
+    return pose[0][:, None] + rotated(pose[1][:, None], points)
+
+
+def rotated(q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Vectors (..., D) from body to world axes; q (..., Q) and r broadcast."""
+    if q.shape[-1] == 2:
+        c, s, x, y = q[..., 0], q[..., 1], r[..., 0], r[..., 1]
+        return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    t = 2.0 * np.cross(q[..., 1:], r)
+    return r + q[..., :1] * t + np.cross(q[..., 1:], t)
+
+
+def _on_plane(a: Side, corners: np.ndarray, b: Side, pose: Pose):
+    assert b.normal is not None
+    normal = rotated(pose[1], b.normal)
+    gap = ((corners - pose[0][:, None]) * normal[:, None]).sum(2) - (b.rounding + a.rounding)[:, None]
+    return gap, corners - (gap + a.rounding[:, None])[..., None] * normal[:, None]
+
+
+def _on_sides(corners: np.ndarray, others: np.ndarray, sides: tuple):
+    """Of each corner and the nearest side of the other in 2D: signed distance (M, V), foot on the side, corner."""
+    start, end = (others[:, [side[n] for side in sides]] for n in (0, 1))
+    along = (end - start)[:, None]
+    to = corners[:, :, None] - start[:, None]
+    share = np.clip((to * along).sum(3) / np.maximum((along**2).sum(3), 1e-30), 0.0, 1.0)
+    foot = start[:, None] + share[..., None] * along
+    distance = np.linalg.norm(corners[:, :, None] - foot, axis=3)
+    nearest = distance.argmin(2)[..., None]
+    inside = (along[..., 0] * to[..., 1] > along[..., 1] * to[..., 0]).all(2) & (len(sides) > 2)
+    gap = np.take_along_axis(distance, nearest, 2)[..., 0] * np.where(inside, -1.0, 1.0)
+    return gap, np.take_along_axis(foot, nearest[..., None], 2)[:, :, 0], corners
+
+
+def _on_faces(corners: np.ndarray, others: np.ndarray, faces: tuple):
+    """Of each corner and the nearest face that it stands over in 3D; an infinite distance if over none."""
+    p, r, s = (others[:, [face[n] for face in faces]] for n in range(3))
+    normal = np.cross(r - p, s - p)
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-30)
+    height = ((corners[:, :, None] - p[:, None]) * normal[:, None]).sum(3)
+    foot = corners[:, :, None] - height[..., None] * normal[:, None]
+    over = np.ones(height.shape, bool)
+    for one, two in ((p, r), (r, s), (s, p)):
+        inward = np.cross(normal, two - one)
+        over &= ((foot - one[:, None]) * inward[:, None]).sum(3) >= -1e-9
+    # Inside, the face that is least deep; outside, the one it stands over.
+    inside = (height < 0).all(2, keepdims=True)
+    gap = np.where(over & (inside | (height >= 0)), np.abs(height), np.inf)
+    nearest = gap.argmin(2)[..., None]
+    least = np.take_along_axis(gap, nearest, 2)[..., 0] * np.where(inside[..., 0], -1.0, 1.0)
+    return least, np.take_along_axis(foot, nearest[..., None], 2)[:, :, 0], corners
+
+
+def _crossing(corners_a: np.ndarray, sides_a: tuple, corners_b: np.ndarray, sides_b: tuple):
+    """Of every two edges in 3D: distance (M, E F), and the nearest points on b and on a."""
+    (p, d), (r, e) = ((c[:, [s[0] for s in sides]], c[:, [s[1] for s in sides]] - c[:, [s[0] for s in sides]])
+                      for c, sides in ((corners_a, sides_a), (corners_b, sides_b)))  # fmt: skip
+    p, d, r, e = p[:, :, None], d[:, :, None], r[:, None], e[:, None]
+    dd, ee, de = (d * d).sum(3), (e * e).sum(3), (d * e).sum(3)
+    between = p - r
+    dp, ep = (d * between).sum(3), (e * between).sum(3)
+    det = dd * ee - de**2
+    s = np.clip(np.where(det > 1e-12 * dd * ee, (de * ep - ee * dp) / np.maximum(det, 1e-30), 0.5), 0, 1)
+    u = np.clip((de * s + ep) / np.maximum(ee, 1e-30), 0, 1)
+    s = np.clip((de * u - dp) / np.maximum(dd, 1e-30), 0, 1)
+    top, foot = p + s[..., None] * d, r + u[..., None] * e
+    shape = (len(corners_a), len(sides_a) * len(sides_b), 3)
+    return np.linalg.norm(top - foot, axis=3).reshape(shape[:2]), foot.reshape(shape), top.reshape(shape)

@@ -1,0 +1,69 @@
+"""Still pictures: the lines that are drawn are the numbers of the trajectory."""
+
+import sys
+
+import numpy as np
+import pytest
+from motions import DOWN, HEIGHT, IMPACT, MASS, RADIUS, E, G, T, bounce
+
+import diffrigid as dr
+from diffrigid import view
+
+
+@pytest.fixture
+def ax():
+    matplotlib = pytest.importorskip("matplotlib.figure")
+    return matplotlib.Figure().subplots()
+
+
+def lines(ax):
+    return {line.get_label(): line.get_xydata() for line in ax.get_lines()}
+
+
+def test_strobe_draws_bodies_where_they_are(ax):
+    run = bounce()
+    drawn = view.strobe(run, pictures=4, ax=ax)
+    discs = [
+        line.get_xydata() for line in drawn.get_lines() if line.get_color() == "C0" and len(line.get_xydata()) == 49
+    ]
+    assert len(discs) == 4
+    for disc, row in zip(discs, (0, 18, 36, 54), strict=True):
+        np.testing.assert_allclose(np.linalg.norm(disc - run.state.x[row, 0], axis=1), RADIUS, rtol=1e-6)
+    np.testing.assert_allclose(lines(ax)["ball"], run.state.x[:, 0])
+    (low, high) = ax.get_xlim()
+    assert low < -RADIUS and high > 1.2 and high - low < 4  # the floor does not widen it
+
+
+def test_energy_and_momentum_are_those_of_the_closed_form(ax):
+    run = bounce()
+    total = lines(view.energy(run, ax=ax))["total"]
+    np.testing.assert_allclose(total[-1, 1] - total[0, 1], -MASS * DOWN**2 / 2 * (1 - E**2), atol=1e-9)
+    p = lines(view.momentum(run, ax=ax))["y"]
+    np.testing.assert_allclose(p[:, 1], MASS * np.where(T < IMPACT, -G * T, E * DOWN - G * (T - IMPACT)), atol=1e-9)
+    assert lines(view.momentum(bounce(3), angular=True, ax=ax))["z"].shape == (55, 2)
+
+
+def test_phase_is_velocity_against_position(ax):
+    falling = T < IMPACT
+    curve = lines(view.phase(bounce(), "ball", "y", ax=ax))["ball"][falling]
+    np.testing.assert_allclose(curve[:, 1] ** 2, 2 * G * (HEIGHT + RADIUS - curve[:, 0]), atol=1e-9)
+    with pytest.raises(ValueError, match="bodies are"):
+        view.phase(bounce(), "bal", ax=ax)
+    with pytest.raises(ValueError, match="2D"):
+        view.strobe(bounce(3), ax=ax)
+
+
+def test_film_has_a_picture_for_every_thirtieth_of_a_second(tmp_path):
+    pytest.importorskip("matplotlib").use("Agg")
+    image = pytest.importorskip("PIL.Image")
+    with image.open(view.film(bounce(), tmp_path / "motion.gif", speed=2.0)) as film:
+        assert film.n_frames == 14
+    with pytest.raises(ValueError, match="ffmpeg"):
+        view.film(bounce(), tmp_path / "motion.avi")
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r"diffrigid\[notebook\]"):
+        view.energy(bounce())
+    assert dr.play(bounce()).page  # and the player does not need it

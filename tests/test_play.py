@@ -1,0 +1,196 @@
+"""The player: what the page holds, and what it refuses."""
+
+import base64
+import html
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+from motions import DOWN, HEIGHT, IMPACT, MASS, RADIUS, E, G, T, bounce, trajectory
+
+import diffrigid as dr
+from diffrigid.view.contacts import find_contacts
+from diffrigid.view.frames import energies
+
+
+def content(player):
+    """The data in a page."""
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', player.page, re.S)[1])
+
+
+def unpacked(packed):
+    """Table (T, K) of packed columns, and the largest error of each by rounding."""
+    whole = np.frombuffer(base64.b64decode(packed["data"]), "<u2").reshape(-1, packed["rows"]).T
+    low, step = np.array(packed["low"]), np.array(packed["step"])
+    return np.where(whole == 65535, np.nan, low + step * whole), step / 2 + 1e-9
+
+
+# ---- what the page holds
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_poses_are_those_of_the_trajectory_to_the_stated_rounding(dim):
+    run = bounce(dim)
+    table, error = unpacked(content(dr.play(run))["runs"][0]["poses"])
+    x, q, v = (np.asarray(leaf) for leaf in (run.state.x, run.state.q, run.state.v))
+    turn = np.unwrap(np.arctan2(q[..., 1:], q[..., :1]), axis=0) if dim == 2 else q
+    wanted = np.concatenate([x, turn, v], axis=2).reshape(len(x), 2, -1)
+    got, error = table.reshape(wanted.shape), error.reshape(wanted.shape[1:])
+    if dim == 3:
+        sign = np.sign((got[..., 3:7] * q).sum(2, keepdims=True))
+        wanted[..., 3:7] *= sign
+        assert ((got[1:, :, 3:7] * got[:-1, :, 3:7]).sum(2) > 0.9).all()  # the short way round
+    assert (np.abs(got - wanted) <= error).all()
+    span = np.ptp(wanted, axis=0)
+    assert (error <= span / 131068 * 1.001 + 2e-9).all()
+
+
+def test_page_is_small_and_loads_nothing():
+    t = np.linspace(0, 2, 121)
+    for player, limit in ((dr.play(bounce(2, t)), 35e3), (dr.play(bounce(3, t)), 250e3)):
+        assert len(player.page) < limit and len(player._repr_html_()) < limit
+        assert not re.search(r"(src|href|action)\s*=\s*[\"']?\s*(https?:|//)", player.page.split("<script>")[0])
+        assert (
+            "default-src 'none'" in player.page
+            and "@import" not in player.page
+            and "url(" not in player.page.split("<script")[0]
+        )
+
+
+def test_notebook_frame_holds_the_page_and_file_too(tmp_path):
+    run = bounce()
+    player = dr.play({"</script><b>": run, "b & 'c'": run}, title="<i>")
+    srcdoc = re.search(r'srcdoc="([^"]*)"', player._repr_html_())[1]
+    assert html.unescape(srcdoc) == player.page == player.save(tmp_path / "a.html").read_text(encoding="utf-8")
+    assert [part["name"] for part in content(player)["runs"]] == ["</script><b>", "b & 'c'"]
+    assert "<i>" not in player.page and 'sandbox="allow-scripts"' in run._repr_html_()
+
+
+def test_turns_between_frames_are_counted():
+    table, _ = unpacked(content(dr.play(bounce(spin=400.0), frames=10))["runs"][0]["poses"])
+    np.testing.assert_allclose(table[:, 2], 400.0 * T[::6], atol=4e-3)
+
+
+def test_few_frames_keep_the_ends_and_uneven_times():
+    run = content(dr.play(bounce(2, T**1.5), frames=7))["runs"][0]
+    kept = np.frombuffer(base64.b64decode(run["t"]), "<f8")
+    np.testing.assert_array_equal(kept, T[::9] ** 1.5)
+    assert run["poses"]["rows"] == 7
+    assert content(dr.play(bounce()))["runs"][0]["t"] == [0.0, 0.9, 54]
+
+
+def test_measured_columns_are_kept_with_what_is_missing():
+    run = bounce()
+    t = T[::3] + 1e-3
+    x = np.where(np.arange(len(t))[:, None] == 4, np.nan, np.stack([t, 2 * t], axis=1))
+    turns = 2 * np.pi * (np.arange(len(t)) % 2)  # of a measured angle do not count
+    seen = content(dr.play(run, {"t": t, "block.x": x, "block.q": np.stack([np.cos(t), np.sin(t)], axis=1)}))["runs"][
+        0
+    ]["measured"]
+    table, error = unpacked(seen["poses"])
+    assert seen["bodies"] == [1]
+    np.testing.assert_allclose(table[:, :3], np.column_stack([x, t]), atol=error.max())
+    assert np.isnan(table[:, 3:]).all() and np.isnan(table[4, :2]).all()
+    by_run = content(dr.play({"a": run, "b": run}, {"b": {"t": t, "ball.angle": 3 * t + turns}}))["runs"]
+    assert by_run[0]["measured"] is None and by_run[1]["measured"]["bodies"] == [0]
+    np.testing.assert_allclose(unpacked(by_run[1]["measured"]["poses"])[0][:, 2], 3 * t, atol=1e-4)
+
+
+# ---- contacts and energies
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("spin", [0.0, 3.0])
+def test_an_impact_is_found_at_its_time_with_its_impulse(dim, spin):
+    run = bounce(dim, spin=spin)
+    table = find_contacts(run, T)
+    (impact,) = table[table[:, 1] == 1]
+    # The flight to it is drawn without gravity: late by g h^2 / 8 v at most
+    assert impact[0] == pytest.approx(IMPACT, abs=G * (T[1] - T[0]) ** 2 / 8 / DOWN)
+    np.testing.assert_allclose(impact[2 : 2 + dim], np.zeros(dim), atol=1e-4)
+    np.testing.assert_allclose(impact[2 + dim :], MASS * (1 + E) * DOWN * np.eye(dim)[-1], atol=1e-6 * MASS * DOWN)
+
+
+@pytest.mark.parametrize(("dim", "points"), [(2, 2), (3, 4)])
+def test_points_that_carry_a_body_carry_its_weight(dim, points):
+    run = bounce(dim)
+    table = find_contacts(run, T)
+    first = table[(table[:, 1] == 0) & (table[:, 0] < T[1] / 2)]
+    assert len(first) == points
+    np.testing.assert_allclose(first[:, 2 + dim :].sum(0), G * (T[1] - T[0]) * np.eye(dim)[-1], atol=1e-6)
+    moment = (first[:, 2] - run.state.x[0, 1, 0]) @ first[:, -1]
+    assert abs(moment) < 1e-6
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_impulse_between_two_bodies_is_found_at_corner_edge_and_round(dim):
+    """Central impacts of equal masses at t = 0.35 h: the first gives its velocity to the second."""
+    pad = (0.0,) * (dim - 2)
+    ball = dr.Disc(radius=0.1) if dim == 2 else dr.Sphere(radius=0.1)
+    box, rod = dr.Box(half=(0.1,) * dim), dr.Capsule(radius=0.05, half_length=0.05)
+    for first, second in ((ball, ball), (ball, box), (rod, box), (box, ball), (rod, rod)):
+        bodies = {
+            "a": dr.Body(first, mass=1.0, x=(-0.1, 0.0, *pad)),
+            "b": dr.Body(second, mass=1.0, x=(0.1035, 0.0, *pad)),
+        }
+        world, state = dr.scene(bodies)
+        h, along = 0.01, np.eye(dim)[0]
+        x0, x1 = np.asarray(state.x), np.asarray(state.x) + np.array([[0.0035], [0.0065]]) * along
+        v0, v1 = np.array([along, 0 * along]), np.array([0 * along, along])
+        still = np.zeros((2, *state.w.shape))
+        run = trajectory(world, [0.0, h], [x0, x1], np.stack([state.q, state.q]), [v0, v1], still)
+        table = find_contacts(run, run.t)
+        assert table[:, 1].all() and abs(table[0, 0] - 0.0035) < 1e-4
+        np.testing.assert_allclose(np.abs(table[:, 2 + dim :].sum(0)), along, atol=1e-6)
+        np.testing.assert_allclose(table[:, 2].mean(), 0.0035, atol=1e-3)
+
+
+def test_energy_of_a_fall_is_constant_until_the_impact():
+    run = bounce()
+    kinetic, potential, total = energies(run.world, run.state).T
+    spin = 0.5 * (0.5 * MASS * RADIUS**2) * 3.0**2
+    before, h = T < IMPACT, run.state.x[:, 0, 1]
+    np.testing.assert_allclose(potential, G * (MASS * h + run.state.x[:, 1, 1]), rtol=1e-12)
+    np.testing.assert_allclose(kinetic[before], spin + MASS * G * (HEIGHT + RADIUS - h[before]), rtol=1e-9)
+    lost = MASS * DOWN**2 / 2 * (1 - E**2)
+    np.testing.assert_allclose(total - total[0], np.where(before, 0.0, -lost), atol=1e-9)
+
+
+def test_energy_counts_springs():
+    bodies = {"ball": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.3, 0.4))}
+    spring = dr.SpringDamper(a="ball", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=8.0, length=0.1)
+    world, state = dr.scene(bodies, forces=[spring])
+    one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
+    np.testing.assert_allclose(energies(world, one), [[0.0, 0.5 * 8 * 0.4**2, 0.5 * 8 * 0.4**2]], rtol=1e-9)
+
+
+# ---- what is refused
+
+
+def test_what_cannot_be_drawn_is_an_error_that_says_how():
+    run = bounce()
+    batch = dr.replace(run, state=jax.tree.map(lambda leaf: np.stack([leaf] * 3, axis=-1), run.state))
+    front = jax.tree.map(lambda leaf: np.stack([leaf] * 3), run)
+    with pytest.raises(ValueError, match=r"leaf\[\.\.\., 0\]"):
+        dr.play(batch)
+    with pytest.raises(ValueError, match=r"leaf\[0\]"):
+        dr.play({"many": front})
+    assert batch._repr_html_() is None and front._repr_html_() is None
+    dr.play(jax.tree.map(lambda leaf: leaf[0], front))
+    with pytest.raises(ValueError, match="rollout"):
+        dr.play(run.state)
+    with pytest.raises(ValueError, match="traced"):
+        jax.jit(lambda run: dr.play(run).height)(run)
+    with pytest.raises(ValueError, match="one dimension"):
+        dr.play({"flat": run, "solid": bounce(3)})
+    with pytest.raises(ValueError, match="at least one"):
+        dr.play({})
+    with pytest.raises(ValueError, match="did you mean ball.x"):
+        dr.play(run, {"t": T, "bal.x": np.zeros((55, 2))})
+    with pytest.raises(ValueError, match="expected names of trajectories"):
+        dr.play({"a": run}, {"c": {"t": T}})
+    for wrong in ({"show": ["trail"]}, {"theme": "blue"}, {"speed": 0.0}, {"frames": 1}, {"plot": "z"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            dr.play(run, **wrong)

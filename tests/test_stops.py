@@ -1,0 +1,154 @@
+"""Limits, friction, motors and damping of joints, against closed forms; and mistakes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+
+INERTIA, RATE = 0.5, 60
+EXACT = 1e-9
+
+
+def wheel(w, dim=2, **along):
+    """A wheel on an axle; in space about an axis that is none of the world's."""
+    if dim == 2:
+        body = dr.Body(None, mass=1.0, inertia=INERTIA, x=(0.0, 0.0), w=w)
+        return dr.scene({"wheel": body}, joints=[dr.Revolute("wheel", anchor_a=0.0, **along)])
+    axis = jnp.array([0.48, 0.64, 0.6])
+    body = dr.Body(None, mass=1.0, inertia=(INERTIA,) * 3, x=(0.0, 0.0, 0.0), w=w * axis)
+    return dr.scene({"wheel": body}, joints=[dr.Revolute("wheel", anchor_a=0.0, axis_a=axis, **along)])
+
+
+def turned(scene, seconds):
+    """Angle turned [rad] and rate at the end [rad/s]."""
+    world, state = scene
+    path = dr.rollout(world, state, dt=1 / RATE, steps=round(seconds * RATE)).state
+    angle = 2 * jnp.arctan2(jnp.linalg.norm(path.q[:, 0, 1:], axis=-1), path.q[:, 0, 0])
+    if world.dim == 2:
+        angle = jnp.arctan2(path.q[:, 0, 1], path.q[:, 0, 0])
+    return jnp.unwrap(angle)[-1], jnp.sqrt((path.w[-1, 0] ** 2).sum())
+
+
+def check_with_slopes(got, expected, arguments, derivative=jax.jacfwd, atol=EXACT):
+    """Two functions of the same numbers, and their slopes, compiled at once."""
+    numbers, which = tuple(map(jnp.asarray, arguments)), tuple(range(len(arguments)))
+    value, slopes = jax.jit(lambda *numbers: (got(*numbers), derivative(got, which)(*numbers)))(*numbers)
+    assert_allclose(value, expected(*numbers), atol=atol)
+    assert_allclose(slopes, jax.jacfwd(expected, which)(*numbers), atol=atol)
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
+def test_a_motor_reaches_its_speed_and_dry_friction_stops_it(derivative):
+    """By I dw / torque, which falls inside a step. Friction is a motor of speed 0."""
+    check_with_slopes(
+        lambda w, speed, torque: turned(wheel(w, friction=torque, speed=speed), 2.0)[0],
+        lambda w, speed, torque: 2.0 * speed + INERTIA * (w - speed) * jnp.abs(w - speed) / (2 * torque),
+        (1.7, 0.3, 0.473),
+        derivative,
+    )
+
+
+def test_a_limit_is_struck_at_its_time():
+    check_with_slopes(
+        lambda w, upper, e: turned(wheel(w, upper=upper, restitution=e), 1.0)[0],
+        lambda w, upper, e: upper - e * (w - upper),
+        (1.7, 1.0, 0.6),
+    )
+
+
+def test_damping_is_exponential():
+    """To the fourth order of the integration."""
+    check_with_slopes(
+        lambda w, damping: turned(wheel(w, damping=damping), 1.0)[1],
+        lambda w, damping: w * jnp.exp(-damping / INERTIA),
+        (1.7, 0.3),
+        atol=1e-8,
+    )
+
+
+def test_a_hinge_in_space_stops_as_in_the_plane():
+    along = {"upper": 1.0, "restitution": 0.6, "friction": 0.1, "damping": 0.02}
+    flat, space = (jax.jit(lambda w, dim=dim: turned(wheel(w, dim, **along), 1.0))(1.7) for dim in (2, 3))
+    assert_allclose(space, flat, atol=1e-9)
+
+
+def test_a_pendulum_rests_on_its_stop():
+    """After rebounds; and its stop is at the same place with an arm that hangs on it by a second joint."""
+
+    def scene(hand):
+        bodies = {"arm": dr.Body(None, mass=1.0, inertia=0.1, x=(0.5, 0.0))}
+        joints = [dr.Revolute("arm", anchor_a=(-0.5, 0.0), lower=-1.0, restitution=0.3)]
+        if hand:
+            bodies["hand"] = dr.Body(None, mass=0.5, inertia=0.05, x=(1.4, 0.0))
+            joints.append(dr.Revolute("hand", "arm", anchor_a=(-0.4, 0.0), friction=0.3, damping=0.1))
+        return dr.scene(bodies, gravity=(0.0, -9.81), joints=joints)
+
+    for hand in (False, True):
+        world, state = scene(hand)
+        path = dr.rollout(world, state, dt=1 / RATE, steps=6 * RATE).state
+        angle = jnp.arctan2(path.q[:, 0, 1], path.q[:, 0, 0])
+        assert float(angle.min()) > -1.0 - 1e-8
+        assert_allclose(angle[-1], -1.0, atol=1e-8)
+        assert float(dr.kinetic_energy(world.bodies, jax.tree.map(lambda leaf: leaf[-1], path)).sum()) < 1e-12
+
+
+def test_a_slider_between_elastic_stops_keeps_its_energy():
+    body = dr.Body(None, mass=1.0, inertia=0.1, x=(0.1, 0.0), v=(1.3, 0.0))
+    slider = dr.Prismatic("body", axis_b=(1.0, 0.0), anchor_b=(0.0, 0.0), lower=-0.2, upper=0.3, restitution=1.0)
+    world, state = dr.scene({"body": body}, joints=[slider])
+    path = dr.rollout(world, state, dt=1 / RATE, steps=4 * RATE).state
+    assert_allclose(jnp.abs(path.v[:, 0, 0]), 1.3, rtol=1e-12)
+    way = 0.1 + 1.3 * np.arange(4 * RATE + 1) / RATE + 0.2  # of an image that is not thrown back
+    assert_allclose(path.x[:, 0, 0], 0.5 - np.abs(way % 1.0 - 0.5) - 0.2, atol=1e-12)
+
+
+def test_a_stiff_hinge_carries_a_load_that_stands_on_it():
+    """Contact and the friction of a joint act on one body: the shelf holds below friction = m g r, else it turns."""
+
+    def drop(friction):
+        bodies = {
+            "shelf": dr.Body(dr.Box(half=(0.5, 0.05)), mass=1.0, x=(0.5, 0.0)),
+            "load": dr.Body(dr.Box(half=(0.1, 0.1)), mass=1.0, x=(0.6, 0.15)),
+        }
+        hinge = dr.Revolute("shelf", anchor_a=(-0.5, 0.0), friction=friction)
+        world, state = dr.scene(bodies, gravity=(0.0, -9.81), friction=0.5, joints=[hinge])
+        return dr.rollout(world, state, dt=1 / RATE, steps=20).state.x[-1, :, 1] - state.x[:, 1]
+
+    needed = 9.81 * (0.5 + 0.6)
+    held, let_go = jax.jit(jax.vmap(drop))(needed * jnp.array([1.01, 0.9]))
+    assert_allclose(held, 0.0, atol=1e-9)
+    assert float(let_go.max()) < -1e-3
+
+
+def test_a_batch_in_single_precision_is_the_same():
+    world, state = wheel(1.7, upper=1.0, restitution=0.6, friction=0.1)
+    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (world, state))
+    speeds = jnp.linspace(-2.0, 2.0, 5, dtype=jnp.float32)
+
+    def end(world, state, w):
+        path = dr.rollout(world, dr.replace(state, w=w[None, None]), dt=1 / RATE, steps=RATE).state
+        return path.q[-1, 0]
+
+    got = jax.jit(jax.vmap(lambda w: end(*single, w)))(speeds)
+    expected = jax.jit(jax.vmap(lambda w: end(world, state, w)))(speeds.astype(float))
+    assert_allclose(got, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "along, message",
+    [
+        ({"lower": 1.0, "upper": -1.0}, "lower is 1 and upper -1: expected lower < upper"),
+        ({"lower": 0.5}, "starts at 0, outside its limits 0.5"),
+        ({"friction": -0.1}, "friction is -0.1: expected 0 or above"),
+        ({"damping": -0.1}, "damping is -0.1: expected 0 or above"),
+        ({"upper": 1.0, "restitution": 1.5}, "restitution is 1.5"),
+        ({"restitution": 0.5}, "give lower or upper"),
+        ({"speed": 1.0}, "give friction"),
+    ],
+)
+def test_mistakes_are_named(along, message):
+    with pytest.raises(ValueError, match=message):
+        wheel(1.0, **along)
