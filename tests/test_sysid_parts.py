@@ -75,7 +75,7 @@ def test_a_start_at_zero_of_a_positive_parameter_is_moved_off():
 
 
 def reading(what, world=WORLD, state=STATE):
-    channel = jax.tree.map(jnp.asarray, channel_of("c", what, world, state))
+    channel = jax.tree.map(jnp.asarray, channel_of("c", what, world))
     return np.asarray(predict(channel, jax.tree.map(lambda leaf: leaf[None], state)))[0]
 
 
@@ -101,9 +101,9 @@ def test_cameras():
 
 def test_angles_are_compared_up_to_full_turns():
     states = jax.tree.map(lambda leaf: leaf[None], STATE)
-    channel = jax.tree.map(jnp.asarray, channel_of("cue.angle", "cue.angle", WORLD, STATE))
+    channel = jax.tree.map(jnp.asarray, channel_of("cue.angle", "cue.angle", WORLD))
     assert_allclose(difference(channel, states, jnp.array([[0.4 + 6 * np.pi]])), [[0.1]], atol=1e-12)
-    channel = jax.tree.map(jnp.asarray, channel_of("cue.q", "cue.q", WORLD, STATE))
+    channel = jax.tree.map(jnp.asarray, channel_of("cue.q", "cue.q", WORLD))
     measured = jnp.array([[np.cos(0.4), np.sin(0.4)]])
     assert_allclose(difference(channel, states, measured), [[0.1]], atol=1e-12)
 
@@ -120,7 +120,7 @@ def test_angles_are_compared_up_to_full_turns():
 )
 def test_bad_observers(what, message):
     with pytest.raises(ValueError, match=message):
-        channel_of("c", what, WORLD, STATE)
+        channel_of("c", what, WORLD)
 
 
 # ---- records
@@ -140,7 +140,7 @@ def test_tables_files_and_dictionaries_say_the_same(tmp_path):
     rows = [f"{t},{t**2},{'' if k == 2 else 0.0}" for k, t in enumerate(T)]
     file.write_text("\n".join(["t,cue.x[1],cue.angle", *rows]) + "\n")
     for data in (Table(), file, read_csv(str(file))):
-        series, _ = columns(WORLD, STATE, data, {})
+        series, _ = columns(WORLD, data, {})
         x, angle = series
         assert (x.name, angle.name) == ("cue.x", "cue.angle")
         assert np.isnan(x.values[:, 0]).all()
@@ -150,7 +150,7 @@ def test_tables_files_and_dictionaries_say_the_same(tmp_path):
 
 def test_columns_may_have_times_of_their_own():
     slow = T[::2] + 0.03
-    series, _ = columns(WORLD, STATE, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
+    series, _ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
     assert_allclose([s.t[-1] for s in series], [T[-1], slow[-1]])
 
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.problem import Group, linearise
 
 STIFF = 1e7  # a damping at which no step is taken any more
@@ -194,7 +195,15 @@ def levenberg(
         reach: the longest step of each number, (a, 1) and (b, 1, 1); a shared number of which it is 0 is held.
     """
     members = tuple(group.members for group in groups)
-    trial = point_at(groups, z)
+    return minimise(partial(point_at, groups), members, z, loss, iterations, reach, report)
+
+
+def minimise(
+    at: Callable[[Numbers], Point], members: tuple[tuple[int, ...], ...], z: Numbers, loss: Any, iterations: int,
+    reach: Numbers, report: Callable[[int, np.ndarray], None],
+) -> tuple[Point, bool]:  # fmt: skip
+    """As `levenberg`, of any residuals: `at` gives them and their Jacobians, for groups of the records `members`."""
+    trial = at(z)
     starts = jnp.zeros_like(z.own, shape=z.own.shape[1:])
     progress = Progress(trial, starts + jnp.inf, starts + 5e-2, starts > 0)
     try:
@@ -203,7 +212,33 @@ def levenberg(
             report(count, np.asarray(progress.cost.sum(0)))
             if count == iterations or bool(progress.done.all()):
                 break
-            trial = point_at(groups, z)
+            trial = at(z)
     except KeyboardInterrupt:
         return progress.point, True
     return progress.point, False
+
+
+def least_squares(residuals: Callable[[Array], Array], z: Array, iterations: int = 60) -> tuple[Array, Array]:
+    """Minimise half the sum of squares of any residuals from many starts, each for itself.
+
+    Args:
+        residuals: of S starts z (n, S), (m, S).
+
+    Returns:
+        z (n, S), and the cost (S).
+    """
+
+    @jax.jit
+    def linear(z: Array) -> tuple[Array, Array]:
+        units = jnp.broadcast_to(jnp.eye(len(z), dtype=z.dtype)[:, :, None], (len(z), *z.shape))
+        return residuals(z), jax.vmap(lambda unit: jax.jvp(residuals, (z,), (unit,))[1], out_axes=1)(units)
+
+    def at(z: Numbers) -> Point:
+        r, jac = linear(z.own[:, 0])
+        return Point(z, (r[:, None],), (jac[:, :, None],))
+
+    z = jnp.asarray(z)
+    numbers = Numbers(jnp.zeros((0, z.shape[1]), z.dtype), z[:, None])
+    reach = Numbers(numbers.shared[:, :1], jnp.full((len(z), 1, 1), jnp.inf, z.dtype))
+    point, _ = minimise(at, ((0,),), numbers, Squares(), iterations, reach, lambda count, costs: None)
+    return point.z.own[:, 0], cost_of(Squares(), point.residuals)

@@ -75,7 +75,7 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
         where = f"observations[{index}]" if several else "observations"
         own_world, own_state = record.world or world, record.state or state
         check(own_world, own_state)
-        series, channels = columns(own_world, own_state, record.observations, observe, where)
+        series, channels = columns(own_world, record.observations, observe, where)
         names = [s.name for s in series]
         if unknown := set(record.noise or {}) - set(names):
             raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
@@ -95,7 +95,7 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
 
 
 def columns(
-    world: World, state: State, observations: Any, observe: Mapping[str, Any], where: str = "observations"
+    world: World, observations: Any, observe: Mapping[str, Any], where: str = "observations"
 ) -> tuple[tuple[Series, ...], dict[str, Channel]]:
     """Columns of a record, and what each observes.
 
@@ -110,7 +110,7 @@ def columns(
     gathered = _gather(table)
     found, channels = [], {}
     for name, values in gathered.items():
-        channel = channel_of(name, observe.get(name, name), world, state)
+        channel = channel_of(name, observe.get(name, name), world)
         if isinstance(values, tuple) and len(values) == 2:
             t, values = _times(values[0], f"{where}[{name!r}]"), values[1]
         elif shared is not None:

@@ -28,7 +28,7 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
     """Pieces of equal duration, with initial states guessed from the first rows of their "x" and "angle" columns."""
     if count < 1:
         raise ValueError(f"segments: count is {count}, expected an integer >= 1")
-    series, channels = columns(world, state, observations, {})
+    series, channels = columns(world, observations, {})
     first, last = min(s.t[0] for s in series), max(s.t[-1] for s in series)
     edges = np.linspace(first, last, count + 1)
     out = []

@@ -23,7 +23,7 @@ from diffrigid.convert import nearest, numbers
 from diffrigid.numerics import norm
 from diffrigid.pytree import Leaf, array, array_fields, map_arrays, pytree, replace, static
 from diffrigid.state import State, material_point, rotations
-from diffrigid.world import World
+from diffrigid.world import World, axis_sizes
 
 FIELDS = ("x", "v", "w", "q", "angle")
 
@@ -134,7 +134,7 @@ def difference(channel: Channel, states: State, measured: Array) -> Array:
     return jnp.arctan2(jnp.sin(away), jnp.cos(away)) if field == "angle" else away
 
 
-def channel_of(name: str, what: Any, world: World, state: State) -> Channel:
+def channel_of(name: str, what: Any, world: World) -> Channel:
     """The channel of a column from what a user says that it observes.
 
     Args:
@@ -143,7 +143,7 @@ def channel_of(name: str, what: Any, world: World, state: State) -> Channel:
     channel = what if isinstance(what, Channel) else Channel(observer=what)
     sizes = {"D": world.dim, "Q": 2 if world.dim == 2 else 4, "H": 3, "P": 2}
     observer = map_arrays(partial(_fill, sizes), _resolved(name, channel.observer, world), name)
-    sizes["M"] = size_of(observer, state)
+    sizes["M"] = size_of(observer, world)
     return map_arrays(partial(_fill, sizes), replace(channel, observer=observer), name)
 
 
@@ -154,9 +154,13 @@ def _fill(sizes: dict[str, int], leaf: Any, letters: tuple[str, ...], path: str)
     return numbers(path, np.broadcast_to(value, axes) if value.ndim == 0 else value, axes)
 
 
-def size_of(observer: Any, state: State) -> int:
+def size_of(observer: Any, world: World) -> int:
     """Numbers that an observer gives for one time."""
-    value = jax.eval_shape(observer, state)
+    sizes, count = axis_sizes(world), len(world.names)
+    shapes = {name: (count, sizes[letter]) for name, letter in zip("xqvw", "DQDA", strict=True)}
+    dtype = jnp.result_type(world.bodies.mass)
+    leaves: dict[str, Any] = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
+    value = jax.eval_shape(observer, State(**leaves))
     if value.ndim != 1:
         raise ValueError(f"an observer returned the shape {value.shape}, expected a number or a vector for one state")
     return value.shape[0]
