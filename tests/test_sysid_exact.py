@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.sysid.covariance import own_covariance, student_quantile
+from diffrigid.sysid.profile import Profile
 
 NOISE, RECORDS = 0.01, 6  # [m]
 FREE = {"gravity": dr.real(), "p.x": dr.each(dr.real()), "p.v": dr.each(dr.real())}
@@ -240,6 +241,47 @@ def test_design_finds_the_launch_that_tells_most():
     )[0]
     best = found.parameters[0]
     assert best.high - best.low < 0.5 * (here.high - here.low)
+
+
+def test_figures_show_residuals_costs_correlations_and_profiles(fit):
+    pytest.importorskip("matplotlib")
+    axes = sysid.residual_figure(fit, record=2).axes[0]
+    drawn = [line.get_ydata() for line in axes.lines if line.get_label().startswith("p.x")]
+    assert_allclose(np.stack(drawn, axis=1), fit.residuals[2]["p.x"][: len(drawn[0])])
+    assert sysid.cost_figure(fit).axes[0].lines[0].get_ydata() == fit.costs
+    assert_allclose(sysid.correlation_figure(fit).axes[0].images[0].get_array(), fit.correlation)
+    found = Profile("k", np.arange(3.0), np.array([1.0, 0.0, 1.0]), 0.5, 0.3, 1.7)
+    assert_allclose(sysid.profile_figure(found).axes[0].lines[0].get_ydata(), found.rise)
+
+
+def test_a_late_clock_is_felt_across_an_impact():
+    """A ball falls from 1 m (its centre 0.1 m above the floor at the impact) and comes back with 0.8 of its speed."""
+    ball = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0))
+    floor = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+    world, state = dr.scene({"ball": ball, "floor": floor}, gravity=(0.0, -9.81), restitution=0.8)
+    hit = np.sqrt(2 * 0.9 / 9.81)
+
+    def height(t):
+        after, speed = t - hit, 0.8 * 9.81 * hit
+        return np.where(t < hit, 1 - 9.81 * t**2 / 2, 0.1 + speed * after - 9.81 * after**2 / 2)
+
+    t = hit + np.array([-0.2, -0.015, 0.004, 0.1])
+    record = dr.Record({"ball.x[1]": t, "t": t}, start=0.0)
+    channel = dr.Channel("ball.x", clock=0.01)
+    problem = sysid.make_problem(
+        world,
+        state,
+        [record],
+        free={"ball.x.clock": dr.real()},
+        observe={"ball.x": channel},
+        noise={"ball.x": 1.0},
+        dt=0.05,
+    )
+    z = sysid.start_vector(problem)
+    seen = sysid.residual_vector(problem, z).reshape(-1, 2)[:, 1] + t
+    assert_allclose(seen, height(t - 0.01), atol=1e-9)
+    slope = sysid.jacobian_matrix(problem, z)[:, 0].reshape(-1, 2)[:, 1]
+    assert_allclose(slope, -(height(t - 0.01 + 1e-6) - height(t - 0.01 - 1e-6)) / 2e-6, rtol=1e-6)
 
 
 def test_records_of_one_shape_share_what_is_compiled():

@@ -9,10 +9,11 @@ from diffrigid.sysid.gradient import first_order, lbfgs
 from diffrigid.sysid.losses import huber, squares, student
 from diffrigid.sysid.profile import profile
 from diffrigid.sysid.records import Record
-from diffrigid.sysid.result import Fit, Parameter, load_fit
+from diffrigid.sysid.result import Fit
 from diffrigid.sysid.segments import segments
 from diffrigid.sysid.sensors import Channel, Homography, Marker, Pinhole, Separation
 from diffrigid.sysid.setup import jacobian_matrix, make_problem, residual_vector, start_vector
+from diffrigid.sysid.summary import Parameter, load_fit
 
 __all__ = [
     "Channel",

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from diffrigid.scene_file import read_scene
 from diffrigid.sysid.fit import fit
-from diffrigid.sysid.result import load_fit
+from diffrigid.sysid.summary import load_fit
 
 
 def main(arguments: Sequence[str]) -> int:

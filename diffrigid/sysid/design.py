@@ -14,8 +14,9 @@ from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Slot, knows, make_slots, put, reference
 from diffrigid.sysid.records import Record
-from diffrigid.sysid.result import Parameter, interval_of, unit_of
+from diffrigid.sysid.result import interval_of, unit_of
 from diffrigid.sysid.setup import Problem, first_numbers, linear_of, make_problem, make_starts, scene_of
+from diffrigid.sysid.summary import Parameter
 from diffrigid.world import World
 
 NUDGE = 1e-3  # of z, for differences

@@ -13,7 +13,7 @@ from diffrigid.sysid.free import Chart, Each, Free, Prior
 from diffrigid.sysid.levenberg import Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import split
-from diffrigid.sysid.result import Fit, Summary, describe, versions
+from diffrigid.sysid.result import Fit, describe
 from diffrigid.sysid.setup import (
     LEAST,
     Problem,
@@ -26,6 +26,7 @@ from diffrigid.sysid.setup import (
     row_mask,
     with_noise,
 )
+from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 
 SQUARES = Squares()
