@@ -6,6 +6,10 @@ The drops that come with the package (see `diffrigid.data`). All share restituti
 the floor; each has its own initial state. Intervals: from the Jacobian, which takes residuals as independent, and from
 how much each drop pulls (`sandwich`). Then some of the drops are held out: fitted on the first, the shared numbers are
 held and only the initial states of the others are found.
+
+Result (November 2026): restitution 0.454, friction 0.074, radius of gyration 21.7 mm; 0.446 to 0.462 for the
+restitution if residuals were independent, 0.402 to 0.507 from how much each drop pulls. Residuals of six drops 0.57
+mm and 0.43 degrees, of the two held out 0.61 mm and 0.96 degrees.
 """
 
 import argparse

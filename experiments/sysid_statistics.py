@@ -7,6 +7,13 @@ its own, from a start beside the truth, the noise estimated too. By parameter: t
 the Cramer-Rao bound at the truth, and how often the 95 % interval holds the truth. Then the same with a drag in the
 records that the fit does not know: how often the intervals hold the truth, and how often the table says not to believe
 them.
+
+Result (November 2026, 500 records, four minutes): variance over the bound (of the whole covariance) 0.99, 1.04 and
+0.96; coverage 94.7, 93.8 and 95.3 % in the mean over the numbers of a scene, 93.4 to 97.2 % of each; of the three
+discs with 2000 records, 1.01 and 94.7 %. With a drag left out the intervals hold the truth in 8 to 33 % of the cases
+(sandwich: 18 to 39 %), and the table warns of every one of them. It does not warn of a smaller drag that the free
+numbers absorb: with 0.08 N s/m instead of 0.3, none of ten records of the box was doubted, and a third of the
+intervals held.
 """
 
 import argparse
