@@ -43,7 +43,7 @@ class Page:
                 assert "error" not in answer, answer
                 return answer["result"]
 
-    def _next(self, seconds=30.0):
+    def _next(self, seconds=120.0):
         while b"\0" not in self._buffer:
             assert select.select([self._receive], [], [], seconds)[0], "the browser does not answer"
             more = os.read(self._receive, 1 << 20)
@@ -73,7 +73,7 @@ class Page:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
-    def wait(self, condition, seconds=20.0):
+    def wait(self, condition, seconds=120.0):
         end = time.monotonic() + seconds
         while not self.run(condition):
             assert time.monotonic() < end, condition
@@ -106,6 +106,6 @@ def chromium():
             yield Page(send, receive)
         finally:
             process.terminate()
-            process.wait(20)
+            process.wait(60)
             os.close(send)
             os.close(receive)

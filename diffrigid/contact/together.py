@@ -45,7 +45,7 @@ from diffrigid.state import rotations
 
 ROUNDS = 40  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start
-PILE = 3  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
+PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
 SMOOTHING = 3  # rounds after each Newton step
 PATIENCE = 3  # rounds that do not lessen a small error: then it is rounding
 REFINEMENTS = 8  # of the linear system of the derivative
