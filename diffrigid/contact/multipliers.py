@@ -75,7 +75,10 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
 
     nothing = jnp.zeros_like(v_rel)
     u, least = twists(nothing, arms, mobility), jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
-    busy = lambda carry: (carry[0] < ROUNDS) & jnp.any(carry[-1] > enough)  # noqa: E731
+
+    def busy(carry):
+        return (carry[0] < ROUNDS) & jnp.any(carry[-1] > enough)
+
     return lax.while_loop(busy, again, (0, u, nothing, nothing, least))[3]
 
 
@@ -88,8 +91,10 @@ def _down(slope: Callable, whole: Array) -> Array:
         over = slope(middle) > 0
         return jnp.where(over, low, middle), jnp.where(over, middle, high)
 
+    def search():
+        return lax.fori_loop(0, HALVINGS, halved, (jnp.zeros_like(whole), whole))[1]
+
     over = slope(whole) > 0
-    search = lambda: lax.fori_loop(0, HALVINGS, halved, (jnp.zeros_like(whole), whole))[1]  # noqa: E731
     return jnp.where(over, lax.cond(jnp.any(over), search, lambda: whole), whole)
 
 
