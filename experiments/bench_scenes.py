@@ -1,0 +1,214 @@
+"""Scenes that `throughput.py` runs, and how each engine builds, steps and reads them.
+
+SI units. `check(x, v)` of the final positions and velocities -> dict with "ok": did the engine do the same physics? To
+add a scene: a function of the world's number (each starts a little differently) and a line in SCENES. `worlds` are the
+batches that diffrigid is measured with.
+"""
+
+import itertools
+import math
+from collections import namedtuple
+
+# Bodies of one shape, (radius,) of discs or the half sizes of boxes, N pairs or triples x, v and w, between walls
+# (normal, offset) that keep normal . x >= offset. chain: each is joined to the one before, the first to the origin.
+FIELDS = "peers worlds dt steps size mass friction restitution gravity walls x v w chain check"
+Scene = namedtuple("Scene", FIELDS, defaults=[None] * len(FIELDS.split()))
+FLAT = ("pymunk", "pyb2d3")
+FLOOR = (((0.0, 1.0), 0.0),)
+
+
+def bounce(world):
+    def check(x, v):  # exact: 0.553 s down, rebound at 0.7 of 5.42 m/s, 0.447 s up
+        return {"height": round(x[0][1], 4), "exact": 1.217, "ok": abs(x[0][1] - 1.217) < 0.02}
+
+    return Scene(
+        peers=FLAT, worlds=(1024, 4096), dt=1 / 240, steps=240, size=(0.5,), mass=1.0, friction=0.0, restitution=0.7, gravity=9.81,
+        walls=FLOOR, x=[(0.0, 2.0 + 0.001 * (world % 97))], v=[(0.3, 0.0)], check=check,
+    )  # fmt: skip
+
+
+def billiards(world):
+    def check(x, v):  # chaotic: no exact end, but some energy is left, and nothing overlaps by 1 cm
+        energy = sum(vx**2 + vy**2 for vx, vy in v) / (16 * 2.0**2)
+        pairs = [0.2 - math.dist(a, b) for a, b in itertools.combinations(x, 2)]
+        overlap = max(0.0, *pairs, *(abs(s - 1.0) - 0.9 for point in x for s in point))
+        ok = 0.1 < energy < 0.5 and overlap < 0.01
+        return {"energy_ratio": round(energy, 3), "overlap": round(overlap, 4), "ok": ok}
+
+    angles = [2.399963 * i + 0.1 * world for i in range(16)]
+    return Scene(
+        peers=FLAT, worlds=(1024, 4096), dt=1 / 240, steps=600, size=(0.1,), mass=1.0, friction=0.0, restitution=0.9, gravity=0.0,
+        walls=(((1.0, 0.0), 0.0), ((-1.0, 0.0), -2.0), ((0.0, 1.0), 0.0), ((0.0, -1.0), -2.0)),
+        x=[(0.25 + 0.5 * (i % 4), 0.25 + 0.5 * (i // 4)) for i in range(16)],
+        v=[(2 * math.cos(a), 2 * math.sin(a)) for a in angles], check=check,
+    )  # fmt: skip
+
+
+def boxes(world):
+    def check(x, v):  # a pile at rest, straight up or toppled
+        heights, speed = [y for _, y in x], max(abs(s) for body in v for s in body)
+        ok = min(heights) > 0.24 and max(heights) < 4.76 and speed < 0.1
+        return {"top": round(max(heights), 3), "lowest": round(min(heights), 4), "speed": round(speed, 4), "ok": ok}
+
+    return Scene(
+        peers=FLAT, worlds=(64,), dt=1 / 240, steps=600, size=(0.25, 0.25), mass=1.0, friction=0.5, restitution=0.0, gravity=9.81,
+        walls=FLOOR, x=[(0.1 * (i % 3 - 1) + 0.0005 * (world % 97), 0.25 + 0.6 * i) for i in range(10)],
+        v=[(0.0, 0.0)] * 10, check=check,
+    )  # fmt: skip
+
+
+def cube_toss(world):
+    def check(x, v):  # flat on the floor
+        speed = max(map(abs, v[0]))
+        return {"height": round(x[0][2], 4), "speed": round(speed, 4), "ok": abs(x[0][2] - 0.05) < 1e-3}
+
+    return Scene(
+        peers=("mujoco",), worlds=(512,), dt=1 / 148, steps=200, size=(0.05,) * 3, mass=0.37, friction=0.18, restitution=0.125,
+        gravity=9.81, walls=(((0.0, 0.0, 1.0), 0.0),), x=[(0.0, 0.0, 0.3)], v=[(1.0 + 0.01 * (world % 97), 0.5, 0.0)],
+        w=[(5.0, 3.0, 2.0)], check=check,
+    )  # fmt: skip
+
+
+def pendulum(world):
+    del world  # all alike
+
+    def check(x, v):  # energy from rest at height 0, without that of rotation
+        energy = sum(9.81 * body[1] for body in x) + 0.5 * sum(s**2 for body in v for s in body)
+        return {"last": [round(s, 3) for s in x[-1]], "energy": round(energy, 3), "ok": -12 < energy < 0.0}
+
+    return Scene(
+        peers=FLAT, worlds=(256,), dt=1 / 240, steps=600, size=(0.25, 0.025), mass=1.0, friction=0.0, restitution=0.0, gravity=9.81,
+        walls=(), x=[(0.5 * (i + 0.5), 0.0) for i in range(5)], v=[(0.0, 0.0)] * 5, chain=True,
+        check=check,
+    )  # fmt: skip
+
+
+SCENES = {"S1": bounce, "S2": billiards, "S3": boxes, "S4": cube_toss, "S5": pendulum}
+
+
+def build_pymunk(scene):
+    import pymunk
+
+    space = pymunk.Space()
+    space.gravity = (0.0, -scene.gravity)
+    space.collision_slop = 0.005  # [m] as Box2D's; the default of 0.1 is meant for pixels
+    shapes = []
+    for (nx, ny), offset in scene.walls:  # a bar 20 m long and 1 m thick
+        cx, cy = nx * (offset - 0.5), ny * (offset - 0.5)
+        ends = (cx - 10 * ny, cy + 10 * nx), (cx + 10 * ny, cy - 10 * nx)
+        shapes.append(pymunk.Segment(space.static_body, *ends, 0.5))
+    sides = tuple(2 * half for half in scene.size)
+    disc = len(sides) == 1
+    moment = (
+        pymunk.moment_for_circle(scene.mass, 0.0, *scene.size) if disc else pymunk.moment_for_box(scene.mass, sides)
+    )
+    bodies = [pymunk.Body(scene.mass, moment) for _ in scene.x]
+    shapes += [pymunk.Circle(b, *scene.size) if disc else pymunk.Poly.create_box(b, sides) for b in bodies]
+    for body, x, v in zip(bodies, scene.x, scene.v, strict=True):
+        body.position, body.velocity = x, v
+    for shape in shapes:  # pymunk multiplies the numbers of the two shapes
+        shape.elasticity, shape.friction = math.sqrt(scene.restitution), math.sqrt(scene.friction)
+        shape.filter = pymunk.ShapeFilter(group=int(bool(scene.chain)))
+    space.add(*bodies, *shapes)
+    for before, body in zip([None, *bodies], bodies, strict=False) if scene.chain else ():
+        hook = (space.static_body, body, (0, 0)) if before is None else (before, body, (scene.size[0], 0))
+        space.add(pymunk.PivotJoint(*hook, (-scene.size[0], 0)))
+    return space, bodies
+
+
+def build_box2d(scene):
+    import pyb2d3
+
+    world = pyb2d3.World(gravity=(0.0, -scene.gravity), restitution_threshold=0.0)
+    world.sleeping_enabled = False
+    material = pyb2d3.surface_material(friction=scene.friction, restitution=scene.restitution)
+    ground = world.create_static_body(position=(0.0, 0.0))
+    for (nx, ny), offset in scene.walls:  # a bar 20 m long and 1 m thick
+        center = nx * (offset - 0.5), ny * (offset - 0.5)
+        bar = pyb2d3.box(hx=0.5, hy=10.0, center=center, rotation=math.atan2(ny, nx))
+        ground.create_shape(pyb2d3.shape_def(material=material), bar)
+    disc = len(scene.size) == 1
+    area = math.pi * scene.size[0] ** 2 if disc else 4 * math.prod(scene.size)
+    apart = {"filter": pyb2d3.make_filter(group_index=-1)} if scene.chain else {}
+    stuff = pyb2d3.shape_def(density=scene.mass / area, material=material, **apart)
+    pairs = zip(scene.x, scene.v, strict=True)
+    bodies = [world.create_dynamic_body(position=x, linear_velocity=v) for x, v in pairs]
+    half = scene.size[0]
+    for body in bodies:
+        body.create_shape(stuff, pyb2d3.circle(radius=half) if disc else pyb2d3.box(hx=half, hy=scene.size[-1]))
+    for before, body in zip([None, *bodies], bodies, strict=False) if scene.chain else ():
+        hook = {"body_a": ground, "local_anchor_a": (0.0, 0.0)}
+        hook = hook if before is None else {"body_a": before, "local_anchor_a": (half, 0.0)}
+        world.create_revolute_joint(body_b=body, local_anchor_b=(-half, 0.0), **hook)
+    return world, bodies
+
+
+def build_mujoco(scene):
+    """One cube. MuJoCo has no restitution: its contacts get the damping ratio that rebounds alike."""
+    import mujoco
+    import numpy as np
+    from mujoco import rollout
+
+    z = -math.log(scene.restitution) / math.hypot(math.pi, math.log(scene.restitution))
+    contact = f'condim="3" friction="{scene.friction} 0.0001 0.0001" solref="{0.0112 / z:.5g} {z:.5g}"'
+    size = " ".join(map(str, scene.size))
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep="{scene.dt}" gravity="0 0 {-scene.gravity}"/><worldbody>'
+        f'<geom type="plane" size="50 50 1" {contact}/>'
+        f'<body><freejoint/><geom type="box" size="{size}" mass="{scene.mass}" {contact}/></body></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qvel[:] = scene.x[0], (*scene.v[0], *scene.w[0])
+    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.zeros((1, mujoco.mj_stateSize(model, full)))
+    mujoco.mj_getState(model, data, state[0], full)
+    return rollout.Rollout(nthread=0), model, data, state
+
+
+def roll_mujoco(world, scene):
+    roller, model, data, state = world
+    states, sensors = roller.rollout(model, data, state, nstep=scene.steps)
+    del sensors
+    return states[0, -1]
+
+
+def build_diffrigid(scene):
+    import diffrigid as dr
+
+    shape = dr.Disc(radius=scene.size[0]) if len(scene.size) == 1 else dr.Box(half=scene.size)
+    start = enumerate(zip(scene.x, scene.v, scene.w or [None] * len(scene.x), strict=True))
+    bodies = {f"b{i}": dr.Body(shape, mass=scene.mass, x=x, v=v, w=w) for i, (x, v, w) in start}
+    walls = {f"wall{i}": dr.Static(dr.HalfSpace(normal=n, offset=d)) for i, (n, d) in enumerate(scene.walls)}
+    names, half = list(bodies), scene.size[0]
+    joints = [dr.Revolute(b, a, anchor_a=(-half, 0.0)) for a, b in zip([None, *names], names, strict=False)]
+    return dr.scene(
+        bodies | walls, contact=dr.Contact(sweeps=1), gravity=(0.0,) * (len(scene.x[0]) - 1) + (-scene.gravity,),
+        restitution=scene.restitution, friction=scene.friction, joints=joints if scene.chain else (),
+        ignore=list(itertools.combinations(names, 2)) if scene.chain else (),
+    )  # fmt: skip
+
+
+def _run(step_arguments):
+    def run(world, scene):
+        for _ in range(scene.steps):
+            world[0].step(scene.dt, *step_arguments)
+        return world
+
+    return run
+
+
+def _read(velocity):
+    # A body of Box2D does not outlive its world.
+    return lambda world: zip(*((tuple(b.position), tuple(getattr(b, velocity))) for b in world[1]), strict=True)
+
+
+def _read_mujoco(state):
+    return [state[1:4].tolist()], [state[8:11].tolist()]
+
+
+# engine: build, all steps of a world, positions and velocities from what that returns. Box2D takes 4 sub-steps.
+PEERS = {
+    "pymunk": (build_pymunk, _run(()), _read("velocity")),
+    "pyb2d3": (build_box2d, _run((4,)), _read("linear_velocity")),
+    "mujoco": (build_mujoco, roll_mujoco, _read_mujoco),
+}
