@@ -22,9 +22,20 @@ def bounce(world):
         return {"height": round(x[0][1], 4), "exact": 1.217, "ok": abs(x[0][1] - 1.217) < 0.02}
 
     return Scene(
-        peers=FLAT, worlds=(1024, 4096), dt=1 / 240, steps=240, size=(0.5,), mass=1.0, friction=0.0, restitution=0.7, gravity=9.81,
-        walls=FLOOR, x=[(0.0, 2.0 + 0.001 * (world % 97))], v=[(0.3, 0.0)], check=check,
-    )  # fmt: skip
+        peers=FLAT,
+        worlds=(1024, 4096),
+        dt=1 / 240,
+        steps=240,
+        size=(0.5,),
+        mass=1.0,
+        friction=0.0,
+        restitution=0.7,
+        gravity=9.81,
+        walls=FLOOR,
+        x=[(0.0, 2.0 + 0.001 * (world % 97))],
+        v=[(0.3, 0.0)],
+        check=check,
+    )
 
 
 def billiards(world):
@@ -37,11 +48,20 @@ def billiards(world):
 
     angles = [2.399963 * i + 0.1 * world for i in range(16)]
     return Scene(
-        peers=FLAT, worlds=(1024, 4096), dt=1 / 240, steps=600, size=(0.1,), mass=1.0, friction=0.0, restitution=0.9, gravity=0.0,
+        peers=FLAT,
+        worlds=(1024, 4096),
+        dt=1 / 240,
+        steps=600,
+        size=(0.1,),
+        mass=1.0,
+        friction=0.0,
+        restitution=0.9,
+        gravity=0.0,
         walls=(((1.0, 0.0), 0.0), ((-1.0, 0.0), -2.0), ((0.0, 1.0), 0.0), ((0.0, -1.0), -2.0)),
         x=[(0.25 + 0.5 * (i % 4), 0.25 + 0.5 * (i // 4)) for i in range(16)],
-        v=[(2 * math.cos(a), 2 * math.sin(a)) for a in angles], check=check,
-    )  # fmt: skip
+        v=[(2 * math.cos(a), 2 * math.sin(a)) for a in angles],
+        check=check,
+    )
 
 
 def boxes(world):
@@ -51,10 +71,20 @@ def boxes(world):
         return {"top": round(max(heights), 3), "lowest": round(min(heights), 4), "speed": round(speed, 4), "ok": ok}
 
     return Scene(
-        peers=FLAT, worlds=(64,), dt=1 / 240, steps=600, size=(0.25, 0.25), mass=1.0, friction=0.5, restitution=0.0, gravity=9.81,
-        walls=FLOOR, x=[(0.1 * (i % 3 - 1) + 0.0005 * (world % 97), 0.25 + 0.6 * i) for i in range(10)],
-        v=[(0.0, 0.0)] * 10, check=check,
-    )  # fmt: skip
+        peers=FLAT,
+        worlds=(64,),
+        dt=1 / 240,
+        steps=600,
+        size=(0.25, 0.25),
+        mass=1.0,
+        friction=0.5,
+        restitution=0.0,
+        gravity=9.81,
+        walls=FLOOR,
+        x=[(0.1 * (i % 3 - 1) + 0.0005 * (world % 97), 0.25 + 0.6 * i) for i in range(10)],
+        v=[(0.0, 0.0)] * 10,
+        check=check,
+    )
 
 
 def cube_toss(world):
@@ -63,10 +93,21 @@ def cube_toss(world):
         return {"height": round(x[0][2], 4), "speed": round(speed, 4), "ok": abs(x[0][2] - 0.05) < 1e-3}
 
     return Scene(
-        peers=("mujoco",), worlds=(512,), dt=1 / 148, steps=200, size=(0.05,) * 3, mass=0.37, friction=0.18, restitution=0.125,
-        gravity=9.81, walls=(((0.0, 0.0, 1.0), 0.0),), x=[(0.0, 0.0, 0.3)], v=[(1.0 + 0.01 * (world % 97), 0.5, 0.0)],
-        w=[(5.0, 3.0, 2.0)], check=check,
-    )  # fmt: skip
+        peers=("mujoco",),
+        worlds=(512,),
+        dt=1 / 148,
+        steps=200,
+        size=(0.05,) * 3,
+        mass=0.37,
+        friction=0.18,
+        restitution=0.125,
+        gravity=9.81,
+        walls=(((0.0, 0.0, 1.0), 0.0),),
+        x=[(0.0, 0.0, 0.3)],
+        v=[(1.0 + 0.01 * (world % 97), 0.5, 0.0)],
+        w=[(5.0, 3.0, 2.0)],
+        check=check,
+    )
 
 
 def pendulum(world):
@@ -77,10 +118,21 @@ def pendulum(world):
         return {"last": [round(s, 3) for s in x[-1]], "energy": round(energy, 3), "ok": -12 < energy < 0.0}
 
     return Scene(
-        peers=FLAT, worlds=(256,), dt=1 / 240, steps=600, size=(0.25, 0.025), mass=1.0, friction=0.0, restitution=0.0, gravity=9.81,
-        walls=(), x=[(0.5 * (i + 0.5), 0.0) for i in range(5)], v=[(0.0, 0.0)] * 5, chain=True,
+        peers=FLAT,
+        worlds=(256,),
+        dt=1 / 240,
+        steps=600,
+        size=(0.25, 0.025),
+        mass=1.0,
+        friction=0.0,
+        restitution=0.0,
+        gravity=9.81,
+        walls=(),
+        x=[(0.5 * (i + 0.5), 0.0) for i in range(5)],
+        v=[(0.0, 0.0)] * 5,
+        chain=True,
         check=check,
-    )  # fmt: skip
+    )
 
 
 SCENES = {"S1": bounce, "S2": billiards, "S3": boxes, "S4": cube_toss, "S5": pendulum}
@@ -182,10 +234,14 @@ def build_diffrigid(scene):
     names, half = list(bodies), scene.size[0]
     joints = [dr.Revolute(b, a, anchor_a=(-half, 0.0)) for a, b in zip([None, *names], names, strict=False)]
     return dr.scene(
-        bodies | walls, contact=dr.Contact(sweeps=1), gravity=(0.0,) * (len(scene.x[0]) - 1) + (-scene.gravity,),
-        restitution=scene.restitution, friction=scene.friction, joints=joints if scene.chain else (),
+        bodies | walls,
+        contact=dr.Contact(sweeps=1),
+        gravity=(0.0,) * (len(scene.x[0]) - 1) + (-scene.gravity,),
+        restitution=scene.restitution,
+        friction=scene.friction,
+        joints=joints if scene.chain else (),
         ignore=list(itertools.combinations(names, 2)) if scene.chain else (),
-    )  # fmt: skip
+    )
 
 
 def _run(step_arguments):
