@@ -1,6 +1,7 @@
 """`python -m diffrigid`: one measured and one synthetic identification, and a report of both."""
 
 import argparse
+import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,7 +15,7 @@ import diffrigid as dr
 from diffrigid.data import FRAME, SquareDrops, square_drops
 from diffrigid.paths import read, write
 from diffrigid.state import State
-from diffrigid.sysid import Free
+from diffrigid.sysid import Free, command
 from diffrigid.view.report import Section, Series, chart, row, text_table, write_report
 
 SIGMA = 0.5  # [mm], [degrees] weight of a residual of a drop: about its size
@@ -77,7 +78,10 @@ at their word. What the data cannot tell: the scale of the masses (the outer two
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fit both, print one table, and write the report."""
+    """Fit both, print one table, and write the report; or, with `fit` first, fit what two files say."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] == ["fit"]:
+        return command.main(arguments[1:])
     options = _options(arguments)
     progress = False if options.quiet else None
 

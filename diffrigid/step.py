@@ -156,9 +156,9 @@ def _rollout_jit(world, state, intervals, controls, counts):
 
 
 def scan_steps(world: World, state: State, intervals: Array, controls: Any, counts: tuple[int, ...]) -> State:
-    """States at the ends of all intervals (T,) [s], after `state` itself; interval k takes counts[k] equal steps."""
+    """States at the ends of intervals (T, *batch) [s], after `state` itself; interval k takes counts[k] equal steps."""
     owner = np.repeat(np.arange(len(counts)), counts)
-    lengths = intervals[owner] / np.array(counts, intervals.dtype)[owner]
+    lengths = intervals[owner] / np.array(counts, intervals.dtype)[owner].reshape(-1, *[1] * (intervals.ndim - 1))
     controls = jax.tree.map(lambda leaf: leaf[owner], controls)
     one_step = fenced(world)
 
@@ -195,7 +195,9 @@ def fenced(world: World):
         def again(state):
             return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
 
-        return lax.cond(dt < jnp.inf, jax.checkpoint(again, prevent_cse=False), lambda state: state, state)
+        return lax.cond(
+            jnp.ravel(dt)[0] < jnp.inf, jax.checkpoint(again, prevent_cse=False), lambda state: state, state
+        )
 
     return jax.checkpoint(one_step, prevent_cse=False)
 

@@ -51,6 +51,7 @@ def piles():
         "wall of 5 x 5 bricks": lambda: boxes(wall(5, 5), (1.0, 0.5)),
         "house of cards": house,
         "pyramid of 5 rows": lambda: boxes(pyramid(5)),
+        "pyramid of 10 rows": lambda: boxes(pyramid(10)),
     }
 
 

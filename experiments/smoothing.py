@@ -23,17 +23,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrigid as dr
-from diffrigid.sysid.levenberg import cost, least_squares
+from diffrigid.sysid.levenberg import least_squares
 
 jax.config.update("jax_enable_x64", True)
 
 RADIUS = 0.1  # [m] of both balls
 AIMS = 80  # shots, all of which miss
 WIDTHS = [RADIUS * 4 / 3 * 0.5**k for k in range(8)] + [0.0]  # [m] from two thirds of the sum of the radii
-
-
-def quiet(count, progress):
-    del count, progress
 
 
 def table(v, width, offset=0.0):
@@ -94,7 +90,7 @@ def aims():
     for name, widths in (("exact", [0.0]), ("annealed", WIDTHS)):
         v = start
         for width in widths:
-            v = np.asarray(least_squares(miss, v, jnp.asarray(width), 40, quiet).z)
+            v = np.asarray(least_squares(partial(miss, width=jnp.asarray(width)), v, 40)[0])
         distance = np.linalg.norm(np.asarray(miss(jnp.asarray(v), 0.0)), axis=0)  # [cm]
         out[f"{name}: share within 1 cm"] = float((distance < 1).mean())
     return out
@@ -120,17 +116,17 @@ def bounces():
     e, v = np.meshgrid(np.linspace(0.35, 0.97, 12), np.linspace(-1.5, 2.5, 12))
     start = np.stack([e.ravel(), v.ravel()])
 
-    def residuals(p, _):
+    def residuals(p):
         return heights(p, None) - measured
 
-    def inside(z, _):  # restitution by a sigmoid, so that it stays in (0, 1)
-        return residuals(jnp.stack([jax.nn.sigmoid(z[0]), z[1]]), None)
+    def inside(z):  # restitution by a sigmoid, so that it stays in (0, 1)
+        return residuals(jnp.stack([jax.nn.sigmoid(z[0]), z[1]]))
 
     z = np.stack([np.log(start[0] / (1 - start[0])), start[1]])
-    result = least_squares(inside, z, None, 120, quiet)
-    found = np.stack([1 / (1 + np.exp(-np.asarray(result.z[0]))), np.asarray(result.z[1])])
+    z, cost = least_squares(inside, z, 120)
+    found = np.stack([1 / (1 + np.exp(-np.asarray(z[0]))), np.asarray(z[1])])
     good = (np.abs(found[0] - 0.8) < 0.02) & (np.abs(found[1] - 0.5) < 0.05)
-    return {"starts": good.size, "share found": float(good.mean()), "best cost": float(jnp.min(cost(result)))}
+    return {"starts": good.size, "share found": float(good.mean()), "best cost": float(jnp.min(cost))}
 
 
 def main():

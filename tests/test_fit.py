@@ -74,7 +74,7 @@ def test_a_parameter_nothing_depends_on_is_an_error():
     ("change", "message"),
     [
         (lambda d: {k: v for k, v in d.items() if k != "t"}, '"t"'),
-        (lambda d: d | {"d0.y": d["d0.x"]}, "did you mean d0"),
+        (lambda d: d | {"d0.y": d["d0.x"]}, "did you mean .d0"),
         (lambda d: d | {"d0.x": d["d0.x"][:5]}, r"expected \(120, 2\)"),
         (lambda d: d | {"t": d["t"][::-1]}, "increasing"),
         (

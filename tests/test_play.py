@@ -187,7 +187,7 @@ def test_what_cannot_be_drawn_is_an_error_that_says_how():
         dr.play({"flat": run, "solid": bounce(3)})
     with pytest.raises(ValueError, match="at least one"):
         dr.play({})
-    with pytest.raises(ValueError, match="did you mean ball.x"):
+    with pytest.raises(ValueError, match="did you mean .ball.x"):
         dr.play(run, {"t": T, "bal.x": np.zeros((55, 2))})
     with pytest.raises(ValueError, match="expected names of trajectories"):
         dr.play({"a": run}, {"c": {"t": T}})

@@ -33,7 +33,7 @@ from diffrigid.contact.slots import meet
 from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.linkage import islands, linkage, spread
-from diffrigid.numerics import FOUND, constant, dot, rows
+from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
@@ -131,16 +131,19 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     found = resting | (strikes.active & (slow | (now & rests)))
     held = jnp.where(push, resting & ~drives, strikes.active & (resting | _falls_along(flight, world, u, dt)))
     now, resting = jnp.where(impact, now, held), jnp.where(impact, found, held)
-    target, force = driving(world, jnp.where(rests | ~impact, 0.0, restitution * u))
-    v_rel = jnp.where(push, jnp.minimum(strikes.gap, 0.0)[:, None] * strikes.normal, strikes.v_rel)
+    began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
+    held_for = jnp.where(impact | push, 0.0, dt[None] - began)
+    # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
+    may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(strikes.gap, 0.0), held_for), 0.0)
+    at_rest = jnp.where(impact | push | (strikes.gap <= 0), 0.0, may_close)
+    target, force = driving(world, jnp.where(impact & ~rests, restitution * u, at_rest))
+    v_rel = jnp.where(push, strikes.gap[:, None] * strikes.normal, strikes.v_rel)
     strikes = replace(strikes, active=now, v_rel=v_rel)
 
     def strike(anchors):
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         evenly = 0.5 * (dt[None] - anchors.t0)
         lever = jnp.where(impact, 0.0, jnp.where(push, 1.0, evenly))
-        began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
-        held_for = jnp.where(impact | push, 0.0, dt[None] - began)
         most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
         mu = jnp.where(push, 0.0, friction)
         return _apply(world, anchors, flight, strikes, (target, mu, most), kick, lever, held_for)

@@ -68,10 +68,10 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
         dy, weight = relative(du), _momenta(du, mobility, D)
 
         def ahead(share: Array) -> Array:  # slope of the convex function there
-            F = pushed(P, y + share * dy)[0]
-            return (weight * (u + share * du - twists(F, arms, mobility))).sum(0)
+            F = pushed(P, y + share[None, None] * dy)[0]
+            return (weight * (u + share[None] * du - twists(F, arms, mobility))).sum(0)
 
-        return count + 1, u + _down(ahead, jnp.ones_like(least)) * du, P, best, least
+        return count + 1, u + _down(ahead, jnp.ones_like(least))[None] * du, P, best, least
 
     nothing = jnp.zeros_like(v_rel)
     u, least = twists(nothing, arms, mobility), jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)

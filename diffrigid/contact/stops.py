@@ -121,7 +121,7 @@ def _struck(gap: Callable, since: Array, start: Array, dt: Array, at_end: Array)
         value, slope = jax.jvp(gap, (s,), (jnp.ones_like(s),))
         low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
         newton = s - value / jnp.where(slope != 0, slope, 1.0)
-        within = (newton > low) & (newton < high) & (slope != 0)
+        within = (newton >= low) & (newton <= high) & (slope != 0)
         return low, high, jnp.where(within, newton, 0.5 * (low + high))
 
     found = lax.fori_loop(0, SEARCH, closer, lax.stop_gradient((since, dt, 0.5 * (since + dt))))[2]

@@ -10,7 +10,7 @@ from jax import Array, lax
 from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix
 from diffrigid.contact.resting import Strikes
-from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
+from diffrigid.contact.sides import Placed, Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
 from diffrigid.contact.stops import find_stops, is_drive, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
@@ -55,8 +55,10 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
     live = jnp.any(dt > 0)
     at_a, at_b = place(a, s, live), place(b, s, live)
     contacts = contacts_of(a, at_a, b, at_b)
-    active = (contacts.gap <= (level + slack)[None]) & hit[None]
-    pull, drift = _acceleration(at_a, at_b), jnp.zeros_like(at_a.x)
+    # At the end those too that the next of a pile fell away from, which may close again once it is held.
+    opened = jnp.where(at_end, dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None), 0.0)
+    active = (contacts.gap <= (level + slack + opened)[None]) & hit[None]
+    drift = jnp.zeros_like(at_a.x)
     if both_move:
         drift = 0.5 * (at_a.v - at_b.v)  # type: ignore[operator]
         held = jnp.where(at_end, 0.5 * (dt - jnp.maximum(a.flight.t0, b.flight.t0)), 0.0)
@@ -65,6 +67,8 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
     def each(normal, point, gap):
         shift = mid_shift if both_move else jnp.where(at_end, 0.5 * gap, 0.0)[None] * normal
         arm_a, arm_b = point - at_a.x + shift, point - at_b.x - shift
+        pulls = [_acceleration(side, at, s, arm) for side, at, arm in ((a, at_a, arm_a), (b, at_b, arm_b))]
+        pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
         return Strikes(
             active=gap < 0, s=s, gap=gap, normal=normal, arm_a=arm_a, arm_b=arm_b,
             K=effective_matrix(at_a, arm_a, at_b, arm_b), v_rel=relative_velocity(at_a, arm_a, at_b, arm_b),
@@ -117,10 +121,18 @@ def ends(world: Any) -> dict[str, tuple[int, ...]]:
     return {"a": a + stop_ends(world, "a"), "b": b + stop_ends(world, "b")}
 
 
-def _acceleration(at_a, at_b) -> Array:
-    if at_b.v is None:
-        return at_a.a
-    return -at_b.a if at_a.v is None else at_a.a - at_b.a
+def _acceleration(side: Side, at: Placed, s: Array, arm: Array) -> Array | None:
+    """Of a point of a collider from its anchor to s, (D, *batch) [m/s^2], in the mean, by forces and torques on it."""
+    f = side.flight
+    if f is None:
+        return None
+    half = 0.5 * (s - f.t0)[None]
+    a = f.a if f.jolt is None else f.a + half * f.jolt
+    if f.tau is None:
+        return a
+    so = rotations(f.dim)
+    tau = f.tau if f.twist is None else f.tau + half * f.twist
+    return a + so.cross(so.apply(at.inverse_inertia, tau), arm)
 
 
 MATERIALS = ("restitution", "friction")

@@ -1,6 +1,60 @@
 """System identification: from measured columns to parameters with intervals."""
 
-from diffrigid.sysid.fit import Fit, Parameter, fit
-from diffrigid.sysid.free import Free, interval, positive, real
+from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
+from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
+from diffrigid.sysid.figures import correlation_figure, cost_figure, profile_figure, residual_figure
+from diffrigid.sysid.fit import fit
+from diffrigid.sysid.free import Free, direction, each, inertia, interval, positive, prior, real, rotation, shares
+from diffrigid.sysid.gradient import first_order, lbfgs
+from diffrigid.sysid.losses import huber, squares, student
+from diffrigid.sysid.profile import profile
+from diffrigid.sysid.records import Record
+from diffrigid.sysid.result import Fit
+from diffrigid.sysid.segments import segments
+from diffrigid.sysid.sensors import Channel, Homography, Marker, Pinhole, Separation
+from diffrigid.sysid.setup import jacobian_matrix, make_problem, residual_vector, start_vector
+from diffrigid.sysid.summary import Parameter, load_fit
 
-__all__ = ["Fit", "Free", "Parameter", "fit", "interval", "positive", "real"]
+__all__ = [
+    "Channel",
+    "Fit",
+    "Free",
+    "Homography",
+    "Marker",
+    "Parameter",
+    "Pinhole",
+    "Record",
+    "Separation",
+    "best_launch",
+    "blind_spots",
+    "bootstrap",
+    "correlation_figure",
+    "cost_figure",
+    "direction",
+    "each",
+    "expected_intervals",
+    "first_order",
+    "fit",
+    "from_jacobian",
+    "huber",
+    "inertia",
+    "interval",
+    "jacobian_matrix",
+    "lbfgs",
+    "load_fit",
+    "make_problem",
+    "positive",
+    "prior",
+    "profile",
+    "profile_figure",
+    "real",
+    "residual_figure",
+    "residual_vector",
+    "rotation",
+    "sandwich",
+    "segments",
+    "shares",
+    "squares",
+    "start_vector",
+    "student",
+]

@@ -3,248 +3,235 @@
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from diffrigid.paths import read, unit, write
 from diffrigid.state import State
-from diffrigid.step import Trajectory, _substeps, aligned, floats, rollout, scan_steps
-from diffrigid.sysid.free import Free
-from diffrigid.sysid.levenberg import Progress, cost, least_squares
-from diffrigid.sysid.residuals import columns, noise_guess
-from diffrigid.sysid.table import html_table, text_table
-from diffrigid.world import World, check
+from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
+from diffrigid.sysid.free import Chart, Each, Free, Prior
+from diffrigid.sysid.levenberg import Point, cost_of, levenberg
+from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.parameters import split
+from diffrigid.sysid.result import Fit, describe
+from diffrigid.sysid.setup import (
+    LEAST,
+    Problem,
+    by_column,
+    fitted_scenes,
+    linear_of,
+    make_problem,
+    make_starts,
+    reach_of,
+    row_mask,
+    with_noise,
+)
+from diffrigid.sysid.summary import Summary, versions
+from diffrigid.world import World
 
-Z95 = 1.959964  # two-sided 95 % quantile of the normal distribution
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One fitted number, or vector."""
-
-    name: str
-    value: np.ndarray
-    low: np.ndarray  # 95 % interval
-    high: np.ndarray
-    unit: str
-    note: str  # "" or why not to trust it
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Result of `fit`: `world` and `state` with the parameters put in, and what is known of them."""
-
-    parameters: tuple[Parameter, ...]
-    world: World
-    state: State
-    t: np.ndarray  # (T+1,) [s] measured times
-    noise: dict[str, float]  # standard deviation of each column's residuals, in its unit
-    costs: np.ndarray  # (starts,) half the weighted sum of squares, lowest first; inf: diverged
-    agree: int  # starts that ended at the best cost
-    covariance: np.ndarray  # of the unbounded parameters z
-    substeps: tuple[int, ...]  # steps of each interval of t
-    seconds: float
-
-    @cached_property
-    def trajectory(self) -> Trajectory:
-        """The fitted motion at the measured times."""
-        return rollout(self.world, self.state, dt=float(np.diff(self.t).max()), times=self.t, substeps=self.substeps)
-
-    def __getitem__(self, name: str) -> Parameter:
-        for parameter in self.parameters:
-            if parameter.name == name:
-                return parameter
-        raise KeyError(f"no parameter {name!r}; there are {[p.name for p in self.parameters]}")
-
-    def __repr__(self) -> str:
-        return text_table(self)
-
-    def _repr_html_(self) -> str:
-        return html_table(self)
+SQUARES = Squares()
+ALIKE = 0.5  # of the loss: a start that ends within this of the best one agrees with it
 
 
 def fit(
     world: World,
     state: State,
-    observations: Mapping[str, Any],
+    observations: Any,
     *,
-    free: Mapping[str | tuple[str, ...], Free],
+    free: Mapping[str | tuple[str, ...], Free | Chart | Each | Prior],
     starts: int = 1,
     dt: float | None = None,
-    noise: Mapping[str, float] | None = None,
+    noise: Mapping[str, Any] | None = None,
+    observe: Mapping[str, Any] | None = None,
     widths: Sequence[float] = (0.0,),
+    windows: Sequence[float] = (np.inf,),
+    loss: Any = SQUARES,
+    solver: Callable | None = None,
+    intervals: Intervals = from_jacobian,
     iterations: int = 60,
     seed: int = 0,
+    resume: Any = None,
     progress: bool | None = None,
 ) -> Fit:
-    """Fit parameters to a record by least squares, from several starts in one batch.
+    """Fit parameters to records by least squares, from several starts in one batch.
 
     Args:
-        observations: "t" [s] and columns "body.x", "body.v", "body.angle", "body.q", "body.w"; NaN is missing.
-            t[0] is the time of `state`.
-        free: what may vary: a path (see `diffrigid.paths`), or a tuple of paths that share one value.
+        observations: "t" [s] and columns "body.x", "body.v", "body.angle", "body.q", "body.w", arrays of K rows, or a
+            table or CSV file with columns "t", "body.x[0]", ...; NaN is missing. A column with times of its own is a
+            pair (t, values). The first time is that of `state`. A list of such, or of `Record`, is fitted together.
+        free: what may vary: a path (see `diffrigid.paths` and `diffrigid.sysid.sensors`), or a tuple of paths that
+            share one value. `each(kind)` gives every record its own.
         starts: the first is at the values of `world` and `state`, the others are random.
         dt: [s] longest step; default the median of the intervals of t.
-        noise: standard deviation of each column, in its unit; default: estimated from the residuals.
+        noise: standard deviation of each column, in its unit, a number or an array like the column; what is not given
+            is estimated from the residuals.
+        observe: what a column observes if its name does not say so: {"tip": Marker("rod", point=(0.3, 0))}.
         widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets
             starts that miss an impact find it.
+        windows: [s] of each record from its start, one fit after the other: (0.5, 1, 2, inf) leads into a long one.
+        loss: squares(), huber() or student().
+        solver: default Levenberg-Marquardt; `first_order(optax.adam(1e-2))` or `lbfgs()` for many numbers.
+        intervals: from_jacobian, sandwich or bootstrap.
         seed: of the random starts.
+        resume: an earlier Fit, or what `load_fit` read: the first start is there.
         progress: print a line as it goes; default: if the output is a terminal or a notebook.
 
-    Raises:
+    Interrupting it returns the best so far. Raises:
         ValueError: unknown names, wrong shapes, or a parameter that nothing measured depends on.
     """
     began = time.time()
-    check(world, state)
-    world, state = floats(world, state)
-    t, measured = columns(world, observations)
-    problem = _Problem.of(world, state, t, measured, dict(free), dt)
-    z = problem.starts(starts, np.random.default_rng(seed))
-    sigma = np.array([(noise or {}).get(column.name, noise_guess(column)) for column in measured])
-    report, result = _printer(progress, starts), None  # type: Any, Any
-    for width in widths:
-        # Twice if the noise is estimated: with the guess, then with what the residuals say.
-        for again in range(1 if noise is not None or width != widths[-1] else 2):
-            if again:
-                sigma = problem.noise(result, sigma)
-            data = (world, state, jnp.asarray(1.0 / sigma, state.x.dtype), jnp.asarray(width, state.x.dtype))
-            result = least_squares(problem.residuals, z, data, iterations, report)
-            z = np.asarray(result.z)
-    report(-1, result)
-    return problem.result(result, sigma, noise is None, began)
+    _check(starts=starts, iterations=iterations, widths=widths, windows=windows)
+    problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
+    solve = levenberg if solver is None else solver
+    z, reach = make_starts(problem, starts, seed), reach_of(problem)
+    report = _printer(progress, starts)
+    stages = [(width, windows[0]) for width in widths] + [(widths[-1], window) for window in windows[1:]]
+    estimate, stopped = bool(problem.noise), False
+    point: Any = None
+    for number, (width, window) in enumerate(stages):
+        # Twice if noise is estimated: with the guess, then with what the residuals say.
+        for again in range(2 if estimate and number == len(stages) - 1 else 1):
+            noise_now = estimated_noise(problem, point, loss) if again else problem.noise
+            problem = with_noise(problem, noise_now, window, width)
+            point, stopped = solve(problem.groups, z, loss, iterations, reach, report)
+            z = point.z
+            if stopped:
+                break
+        if stopped:
+            break
+    report(-1, np.asarray(cost_of(loss, point.residuals)))
+    return finish(problem, point, loss, intervals, seed, began, ["interrupted: the best so far"] if stopped else [])
 
 
-class _Problem:
-    """The maps z -> parameters -> world -> residuals, with all that does not change."""
-
-    def __init__(self, world, state, t, measured, free, counts):
-        self.world, self.state, self.t, self.measured = world, state, t, measured
-        self.free, self.counts = free, counts
-        self.paths = [(path,) if isinstance(path, str) else tuple(path) for path in free]
-        self.shapes = [np.shape(read(world, state, path[0])) for path in self.paths]
-        self.known = [column.known for column in measured]
-
-    @classmethod
-    def of(cls, world, state, t, measured, free, dt) -> "_Problem":
-        if not free:
-            raise ValueError('free: nothing to fit; give paths, for example {"restitution": interval(0, 1)}')
-        for path, kind in free.items():
-            if not isinstance(kind, Free):
-                raise ValueError(f"free[{path!r}]: expected interval(low, high), positive() or real(), got {kind!r}")
-        dt = float(np.median(np.diff(t))) if dt is None else dt
-        return cls(world, state, t, measured, free, _substeps(jnp.asarray(t), jnp.asarray(dt)))
-
-    def split(self, z):
-        """z (n, ...) in pieces of the parameters' shapes."""
-        ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes])
-        pieces = np.split(z, ends[:-1]) if isinstance(z, np.ndarray) else jnp.split(z, ends[:-1])
-        return [piece.reshape(shape) for piece, shape in zip(pieces, self.shapes, strict=True)]
-
-    def put(self, world, state, z):
-        """World and state with the parameters of one start, z (n,)."""
-        for paths, kind, piece in zip(self.paths, self.free.values(), self.split(z), strict=True):
-            for path in paths:
-                world, state = write(world, state, path, kind.value(piece))
-        return world, state
-
-    def starts(self, count: int, random: np.random.Generator) -> np.ndarray:
-        """z of every start, (n, S)."""
-        values = [np.asarray(read(self.world, self.state, paths[0]), float) for paths in self.paths]
-        kinds = list(self.free.values())
-        first = [kind.unbounded(value).ravel() for kind, value in zip(kinds, values, strict=True)]
-        others = [
-            [kind.draw(value, random).ravel() for kind, value in zip(kinds, values, strict=True)]
-            for _ in range(count - 1)
-        ]
-        z = np.stack([np.concatenate(start) for start in [first, *others]], axis=1)
-        return z.astype(self.state.x.dtype)
-
-    def simulate(self, world, state):
-        """States at the measured times, (T+1, N, ..., *batch)."""
-        intervals = jnp.asarray(np.diff(self.t), state.x.dtype)
-        return scan_steps(*aligned(world, state), intervals, None, self.counts)
-
-    def residuals(self, z, data):
-        """Weighted residuals of S starts, (m, S)."""
-        world, state, weights, width = data
-        world, state = write(world, state, "contact.width", width)
-        world, state = jax.vmap(lambda z: self.put(world, state, z), in_axes=-1, out_axes=-1)(z)
-        states = self.simulate(world, state)
-        parts = []
-        for index, (column, known) in enumerate(zip(self.measured, self.known, strict=True)):
-            difference = column.predicted_minus_measured(states)
-            parts.append(weights[index] * difference[np.nonzero(known)])
-        return jnp.concatenate(parts)
-
-    def noise(self, result: Progress, sigma: np.ndarray) -> np.ndarray:
-        """Standard deviation of every column's residuals at the best start."""
-        best = np.asarray(result.residuals)[:, int(np.argmin(cost(result)))]
-        ends = np.cumsum([known.sum() for known in self.known])
-        pieces = np.split(best, ends[:-1])
-        lost = result.z.shape[0] / len(best)
-        rms = [np.sqrt(np.mean(piece**2) / max(1.0 - lost, 0.05)) if piece.size else 1.0 for piece in pieces]
-        return np.maximum(sigma * np.array(rms), 1e-9)
-
-    def result(self, progress: Progress, sigma: np.ndarray, estimated: bool, began: float) -> Fit:
-        costs = np.asarray(cost(progress), float)
-        costs = np.where(np.isfinite(costs), costs, np.inf)
-        best = int(np.argmin(costs))
-        z, jac = np.asarray(progress.z)[:, best], np.asarray(progress.jacobian, float)[:, :, best]
-        self._refuse_blind(jac)
-        dof = max(jac.shape[0] - jac.shape[1], 1)
-        scale = 2.0 * costs[best] / dof if estimated else 1.0
-        covariance = scale * np.linalg.pinv(jac.T @ jac, rcond=1e-12)
-        world, state = jax.jit(self.put)(self.world, self.state, jnp.asarray(z))
-        names = [column.name for column in self.measured]
-        return Fit(
-            parameters=self.parameters(z, np.sqrt(np.diag(covariance))),
-            world=world,
-            state=state,
-            t=self.t,
-            substeps=self.counts,
-            noise=dict(zip(names, sigma.tolist(), strict=True)),
-            costs=np.sort(costs),
-            agree=int((costs <= costs[best] + 0.5 + 1e-3 * costs[best]).sum()),
-            covariance=covariance,
-            seconds=time.time() - began,
-        )
-
-    def parameters(self, z: np.ndarray, error: np.ndarray) -> tuple[Parameter, ...]:
-        out = []
-        rows = zip(self.paths, self.free.values(), self.split(z), self.split(error), strict=True)
-        for paths, kind, centre, spread in rows:
-            value, low, high = np.asarray(kind.value(np.stack([centre + k * spread for k in (0.0, -Z95, Z95)])))
-            name = " = ".join(paths)
-            note = "at its bound" if kind.at_bound(value) else ""
-            out.append(Parameter(name=name, value=value, low=low, high=high, unit=unit(paths[0]), note=note))
-        return tuple(out)
-
-    def _refuse_blind(self, jac: np.ndarray) -> None:
-        """A parameter that no residual depends on is an error, not a number with an infinite interval."""
-        norms = self.split(np.sqrt((jac**2).sum(0)))
-        for paths, norm in zip(self.paths, norms, strict=True):
-            if not np.any(norm > 0):
-                raise ValueError(
-                    f"free: nothing that was measured depends on {' = '.join(paths)} at the best fit: "
-                    "leave it out, or give a record with an impact that shows it"
-                )
+def _check(starts: int, iterations: int, widths: Sequence[float], windows: Sequence[float]) -> None:
+    for name, value in (("starts", starts), ("iterations", iterations)):
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"{name} is {value!r}, expected an integer >= 1")
+    if not len(widths) or min(widths) < 0:
+        raise ValueError(f"widths is {widths!r}, expected lengths >= 0 [m], the last one usually 0")
+    if not len(windows) or min(windows) <= 0:
+        raise ValueError(f"windows is {windows!r}, expected times > 0 [s], the last one usually inf")
 
 
-def _printer(progress: bool | None, starts: int) -> Callable[[int, Progress], None]:
+def finish(
+    problem: Problem, point: Point, loss: Any, intervals: Intervals, seed: int, began: float, remarks: list[str]
+) -> Fit:
+    """The result at the best start, with noise as the residuals say."""
+    if problem.noise:
+        noise = estimated_noise(problem, point, loss)
+        point, problem = rescaled(problem, point, noise), with_noise(problem, noise)
+    costs = np.asarray(cost_of(loss, point.residuals), float)
+    best = int(np.argmin(costs))
+    if not np.isfinite(costs[best]):
+        raise ValueError("fit: no start gives a finite motion: look at the values of the scene, or make dt smaller")
+    linear = linear_of(problem, point, best, loss, bool(problem.noise))
+    _refuse_blind(problem, linear)
+    shared, own = np.asarray(point.z.shared, float)[:, best], np.asarray(point.z.own, float)[..., best]
+    uncertainty = intervals(linear)
+    scenes = tuple(fitted_scenes(problem, shared, own))
+    residuals = tuple(by_column(problem, point, best))
+    parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, scenes)
+    order = np.argsort(costs)
+    summary = Summary(
+        parameters=parameters, noise=_all_noise(problem), costs=costs[order],
+        agree=int((costs <= costs[best] + ALIKE + 1e-3 * costs[best]).sum()), notes=(*remarks, *notes), seed=seed,
+        seconds=time.time() - began, versions=versions(),
+    )  # fmt: skip
+    return Fit(
+        summary, problem, scenes, shared, own, linear, uncertainty, residuals,
+        np.asarray(point.z.shared, float)[:, order], loss,
+    )  # fmt: skip
+
+
+def estimated_noise(problem: Problem, point: Point, loss: Any) -> dict[str, float]:
+    """Standard deviation of the residuals of each column whose noise is not given, at the best start.
+
+    Each column gives up as many numbers as its residuals say of the parameters (the trace of its part of the hat
+    matrix), so that the estimate is without bias. With a robust loss, from the median of the absolute values.
+    """
+    best = int(np.argmin(np.asarray(cost_of(loss, point.residuals))))
+    linear, residuals = linear_of(problem, point, best, loss, True), by_column(problem, point, best)
+    lost, found = _lost(problem, linear), {}
+    for name, sigma in problem.noise.items():
+        free = [r[name] for run, r in zip(problem.runs, residuals, strict=True) if name in r and name not in run.noise]
+        values = np.concatenate([piece[np.isfinite(piece)] for piece in free])
+        share = max(1.0 - lost[name] / max(len(values), 1), 0.05)
+        size = np.mean(values**2) if isinstance(loss, Squares) else (1.4826 * np.median(np.abs(values))) ** 2
+        found[name] = max(float(sigma * np.sqrt(size / share)), LEAST) if len(values) else sigma
+    return found
+
+
+def _lost(problem: Problem, linear: Linear) -> dict[str, float]:
+    """How many numbers the residuals of each column determine: sum of their leverages."""
+    lost = dict.fromkeys(problem.noise, 0.0)
+    shared = inverse(information(linear))
+    for group in problem.groups:
+        for k, member in enumerate(group.members):
+            hat = leverages(linear, member, shared)
+            rows = row_mask(problem, group, k, sum(w.shape[0] * w.shape[1] for w in group.data.weights.values()))[0]
+            names = np.concatenate([np.full(w.shape[0] * w.shape[1], n) for n, w in group.data.weights.items()])[rows]
+            for name in lost:
+                lost[name] += float(hat[: len(names)][names == name].sum())
+    return lost
+
+
+def leverages(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
+    """Diagonal of J (J^T J)^-1 J^T for the rows of a record, (m,)."""
+    J = eliminated(linear, record)[0]
+    own = linear.slopes[record][:, linear.shared :]
+    hat = np.einsum("mi,ij,mj->m", J, shared, J)
+    if own.shape[1]:
+        basis = np.linalg.svd(own / np.maximum(np.abs(own).max(0), 1e-300), full_matrices=False)[0]
+        hat = hat + (basis**2).sum(1)
+    return hat
+
+
+def rescaled(problem: Problem, point: Point, noise: Mapping[str, float]) -> Point:
+    """A point as it would be with another noise."""
+    residuals, jacobians = [], []
+    for group, r, jac in zip(problem.groups, point.residuals, point.jacobians, strict=True):
+        ratios = []
+        for name, w in group.data.weights.items():
+            change = [
+                1.0 if name in problem.runs[k].noise else problem.noise[name] / noise[name] for k in group.members
+            ]
+            ratios.append(np.broadcast_to(change, (w.shape[0] * w.shape[1], len(change))))
+        ratio = np.concatenate(ratios)
+        ratio = np.concatenate([ratio, np.ones((len(r) - len(ratio), ratio.shape[1]))]).astype(r.dtype)
+        residuals.append(np.asarray(r) * ratio[:, :, None])
+        jacobians.append(np.asarray(jac) * ratio[:, None, :, None])
+    return Point(point.z, tuple(residuals), tuple(jacobians))
+
+
+def _all_noise(problem: Problem) -> dict[str, float]:
+    """Noise by column: estimated, or the median of what was given."""
+    noise = dict(problem.noise)
+    for run in problem.runs:
+        for name in run.channels:
+            noise.setdefault(name, float(np.median(run.noise[name])) if name in run.noise else np.nan)
+    return noise
+
+
+def _refuse_blind(problem: Problem, linear: Linear) -> None:
+    """A parameter that no residual depends on is an error, not a number with an infinite interval."""
+    sizes = sum((slopes**2).sum(0) for slopes in linear.slopes)
+    for slot, size in zip((*problem.shared, *problem.own), split((*problem.shared, *problem.own), sizes), strict=True):
+        if not np.any(size > 0):
+            raise ValueError(
+                f"free: nothing that was measured depends on {slot.name} at the best fit: "
+                "leave it out, or give a record that shows it: an impact for restitution, one that slips for friction"
+            )
+
+
+def _printer(progress: bool | None, starts: int) -> Callable[[int, np.ndarray], None]:
     """Prints the iteration and the best cost, over one line."""
     if progress is None:
         progress = sys.stdout.isatty() or "ipykernel" in sys.modules
 
-    def report(count: int, result: Progress) -> None:
+    def report(count: int, costs: np.ndarray) -> None:
         if progress:
-            best = float(np.min(cost(result)))
             end = "\n" if count < 0 else "\r"
             label = "done" if count < 0 else f"iteration {count:3d}"
-            print(f"fit: {label}, {starts} starts, best cost {best:.6g}      ", end=end, flush=True)
+            print(f"fit: {label}, {starts} starts, best cost {float(np.min(costs)):.6g}      ", end=end, flush=True)
 
     return report

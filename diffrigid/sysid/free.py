@@ -1,13 +1,30 @@
-"""What may vary in a fit: a bound, the map from an unbounded number z to it, and where random starts lie."""
+"""What may vary in a fit: the map from unbounded numbers z to a parameter, and where random starts lie.
 
+A kind of parameter is a frozen record with the verbs
+
+    size(shape)               how many numbers z a parameter of this shape takes
+    value(z, reference)       the parameter for z (k,); `reference` is its value at the start
+    unbounded(reference)      the z whose value is the reference, pulled off its bounds
+    draw(reference, random)   z of a random start
+    at_bound(value)           true if a result lies on a bound
+    scale(reference)          (k,) a change of z that is large: what the data cannot tell is measured by it
+
+`each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds what is known beforehand.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from diffrigid import so2, so3
+
 NEAR_BOUND = 1e-3  # [-] of an interval: a start on a bound is pulled off it, a result this close is reported
+PULL = 1e-3  # a start at or below the bound of a positive parameter begins this far above it, in its unit
 
 
 @dataclass(frozen=True)
@@ -18,37 +35,91 @@ class Free:
     high: float = np.inf
     spread: float = 1.0
 
-    def value(self, z: Array) -> Array:
-        """The parameter for z: z itself, low + exp(z), or low + (high - low) / (1 + exp(-z))."""
-        if np.isfinite(self.high):
-            return self.low + (self.high - self.low) * jax.nn.sigmoid(z)
-        return z if np.isinf(self.low) else self.low + jnp.exp(z)
+    def size(self, shape: tuple[int, ...]) -> int:
+        return int(np.prod(shape))
 
-    def unbounded(self, value: np.ndarray) -> np.ndarray:
-        """z for a value, which is first pulled off its bounds."""
-        value = np.asarray(value, float)
+    def value(self, z: Any, reference: Any = None) -> Any:
+        """z itself, low + exp(z), or low + (high - low) / (1 + exp(-z)), in the shape of the reference."""
+        z = z if reference is None else z.reshape(jnp.shape(reference))
+        if np.isfinite(self.high):
+            return self.low + (self.high - self.low) * (_sigmoid(z) if isinstance(z, np.ndarray) else jax.nn.sigmoid(z))
+        return z if np.isinf(self.low) else self.low + (np if isinstance(z, np.ndarray) else jnp).exp(z)
+
+    def unbounded(self, reference: np.ndarray) -> np.ndarray:
+        value = np.asarray(reference, float)
         if np.isfinite(self.high):
             share = np.clip((value - self.low) / (self.high - self.low), NEAR_BOUND, 1.0 - NEAR_BOUND)
-            return np.log(share / (1.0 - share))
-        return value if np.isinf(self.low) else np.log(np.maximum(value - self.low, 1e-12))
+            return np.log(share / (1.0 - share)).ravel()
+        if np.isinf(self.low):
+            return value.ravel()
+        return np.log(np.where(value > self.low, value - self.low, PULL)).ravel()
 
-    def draw(self, value: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """z of a random start: uniform in an interval; a factor exp(spread N) about value - low if positive;
-        normal with standard deviation spread * max(|value|, 1) about the value if real."""
-        value = np.asarray(value, float)
+    def draw(self, reference: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Uniform in an interval; a factor exp(spread N) about value - low if positive; normal with standard
+        deviation spread * max(rms, 1) about the value if real."""
+        value = np.asarray(reference, float)
         if np.isfinite(self.high):
             return self.unbounded(random.uniform(self.low, self.high, value.shape))
-        noise = self.spread * random.standard_normal(value.shape)
-        if np.isinf(self.low):
-            return value + noise * max(float(np.linalg.norm(value)) / max(value.size, 1) ** 0.5, 1.0)
-        return self.unbounded(value) + noise
+        return self.unbounded(value) + self.spread * self.scale(value) * random.standard_normal(value.size)
 
     def at_bound(self, value: np.ndarray) -> bool:
-        """True if a value lies on a bound, to within NEAR_BOUND of the interval."""
         if not np.isfinite(self.high):
             return False
         edge = NEAR_BOUND * (self.high - self.low)
         return bool(np.any(value - self.low < edge) or np.any(self.high - value < edge))
+
+    def scale(self, reference: np.ndarray) -> np.ndarray:
+        value = np.asarray(reference, float)
+        real = np.isinf(self.low) and np.isinf(self.high)
+        rms = float(np.sqrt(np.mean(value**2))) if value.size else 1.0
+        return np.full(value.size, max(rms, 1.0) if real else 1.0)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A parameter with a condition on it, as a smooth map of z about the reference, which is at z = 0."""
+
+    name: str
+    size_of: Callable[[tuple[int, ...]], int]  # raises ValueError for a shape that the map does not take
+    map: Callable[[Array, Array], Array]  # (z, reference) -> value
+    spread: float  # standard deviation of the z of random starts
+
+    def size(self, shape: tuple[int, ...]) -> int:
+        return self.size_of(shape)
+
+    def value(self, z: Array, reference: Array) -> Array:
+        return self.map(z, reference)
+
+    def unbounded(self, reference: np.ndarray) -> np.ndarray:
+        return np.zeros(self.size(np.shape(reference)))
+
+    def draw(self, reference: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        return self.spread * random.standard_normal(self.size(np.shape(reference)))
+
+    def at_bound(self, value: np.ndarray) -> bool:
+        return False
+
+    def scale(self, reference: np.ndarray) -> np.ndarray:
+        return np.ones(self.size(np.shape(reference)))
+
+
+Kind = Free | Chart
+
+
+@dataclass(frozen=True)
+class Each:
+    """A parameter of which every record has its own value."""
+
+    kind: Any
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A parameter of which something is known: normal about `mean`, with a standard deviation, in its unit."""
+
+    kind: Any
+    mean: Any  # a number or a tuple
+    deviation: Any
 
 
 def interval(low: float, high: float) -> Free:
@@ -66,3 +137,102 @@ def positive(spread: float = 0.5) -> Free:
 def real(spread: float = 0.5) -> Free:
     """Any number; random starts are spread * max(rms, 1) N(0, 1) away."""
     return Free(spread=spread)
+
+
+def direction(spread: float = 0.5) -> Chart:
+    """A vector of which only the direction varies, by an angle in 2D and by two in 3D: {"gravity": direction()}."""
+    return Chart(name="direction", size_of=_direction_size, map=_turned_vector, spread=spread)
+
+
+def rotation(spread: float = 0.5) -> Chart:
+    """An orientation, turned by exp(z) in world axes, one angle in 2D and three in 3D: {"die.q": rotation()}."""
+    return Chart(name="rotation", size_of=_rotation_size, map=_turned, spread=spread)
+
+
+def inertia(spread: float = 0.3) -> Chart:
+    """A (3, 3) inertia that stays one of a mass distribution: {"die.inertia": inertia()}."""
+    return Chart(name="inertia", size_of=_inertia_size, map=_physical_inertia, spread=spread)
+
+
+def shares(spread: float = 0.5) -> Chart:
+    """Ratios of several numbers: {("cue.mass", "ball.mass"): shares()} keeps the sum of both."""
+    return Chart(name="shares", size_of=_shares_size, map=_same_sum, spread=spread)
+
+
+def each(kind: Any) -> Each:
+    """Of many records, each with its own value: {"ball.v": each(real())}."""
+    return Each(kind=kind)
+
+
+def prior(kind: Any, mean: Any, deviation: Any) -> Prior:
+    """A Gaussian prior beside the data: {"ball.mass": prior(positive(), 1.2, 0.1)}."""
+    if not np.all(np.asarray(deviation, float) > 0):
+        raise ValueError(f"prior: deviation is {deviation}, expected > 0, in the unit of the parameter")
+    flat = tuple(np.ravel(np.asarray(mean, float)).tolist())
+    return Prior(kind=kind, mean=flat, deviation=tuple(np.ravel(np.asarray(deviation, float)).tolist()))
+
+
+def _sigmoid(z: np.ndarray) -> np.ndarray:
+    """In NumPy, without overflow: a result has a few numbers, and JAX would compile for each of them."""
+    small = np.exp(-np.abs(z))
+    return np.where(z >= 0, 1.0, small) / (1.0 + small)
+
+
+def _direction_size(shape: tuple[int, ...]) -> int:
+    if shape not in ((2,), (3,)):
+        raise ValueError(f"direction: the parameter has shape {shape}, expected a vector of 2 or 3 numbers")
+    return shape[0] - 1
+
+
+def _turned_vector(z: Array, reference: Array) -> Array:
+    if reference.shape == (2,):
+        return so2.rotate(so2.exp(z), reference)
+    along = reference / jnp.sqrt((reference**2).sum())
+    first, second = so3.tangents(along)
+    return so3.rotate(so3.exp(z[0] * first + z[1] * second), reference)
+
+
+def _rotation_size(shape: tuple[int, ...]) -> int:
+    if shape not in ((2,), (4,)):
+        raise ValueError(f"rotation: the parameter has shape {shape}, expected an orientation q of 2 or 4 numbers")
+    return 1 if shape == (2,) else 3
+
+
+def _turned(z: Array, reference: Array) -> Array:
+    so = so2 if reference.shape == (2,) else so3
+    return so.compose(so.exp(z), reference)
+
+
+def _inertia_size(shape: tuple[int, ...]) -> int:
+    if shape != (3, 3):
+        raise ValueError(f"inertia: the parameter has shape {shape}, expected (3, 3); in 2D use positive()")
+    return 6
+
+
+def _physical_inertia(z: Array, reference: Array) -> Array:
+    """With the second moments S = integral of r r^T dm, I = tr(S) 1 - S is physical if S is positive definite.
+
+    S = C T T^T C^T with the Cholesky factor C of that of the reference and T lower triangular, exp(z) on its diagonal.
+    Source: Wensing, Kim, Slotine, Linear Matrix Inequalities for Physically Consistent Inertial Parameters, 2018.
+    """
+    eye = jnp.eye(3, dtype=z.dtype)
+    moments = 0.5 * jnp.trace(reference) * eye - reference
+    zero = jnp.zeros_like(z[0])
+    scale = jnp.exp(z[:3])
+    factor = jnp.stack(
+        [jnp.stack(row) for row in ([scale[0], zero, zero], [z[3], scale[1], zero], [z[4], z[5], scale[2]])]
+    )
+    half = jnp.linalg.cholesky(moments) @ factor
+    moments = half @ half.T
+    return jnp.trace(moments) * eye - moments
+
+
+def _shares_size(shape: tuple[int, ...]) -> int:
+    if len(shape) != 1 or shape[0] < 2:
+        raise ValueError("shares: expected a tuple of two or more paths of numbers, whose sum is kept")
+    return shape[0] - 1
+
+
+def _same_sum(z: Array, reference: Array) -> Array:
+    logs = jnp.log(reference) + jnp.concatenate([jnp.zeros_like(z[:1]), z])
+    return reference.sum() * jax.nn.softmax(logs)

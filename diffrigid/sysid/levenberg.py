@@ -1,9 +1,13 @@
-"""Levenberg-Marquardt on a batch of starts at once, with Jacobians by forward mode.
+"""Levenberg-Marquardt on a batch of starts at once, for numbers that all records share and those of each record.
 
-Source: Levenberg 1944, Marquardt 1963; damping as in Nielsen, IMM-REP-1999-05.
+The normal equations have the shape of an arrow: blocks A of the shared numbers, D_r of those of record r, and B_r
+between both. Those of the records are eliminated (Schur's complement), so that a thousand records cost a thousand small
+solves and one more.
+
+Source: Levenberg 1944, Marquardt 1963; Triggs et al., Bundle Adjustment, 2000, for the arrow.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,88 +16,229 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.problem import Group, linearise
+
+STIFF = 1e7  # a damping at which no step is taken any more
+SMALL = 1e-9  # a decrease still to be had, relative to the cost of one residual, that is nothing
+
+
+class Numbers(NamedTuple):
+    """z of a number of starts S."""
+
+    shared: Array  # (a, S)
+    own: Array  # (b, R, S)
+
+    def of(self, members: Sequence[int]) -> Array:
+        """All numbers of some records, (a + b, R of them, S)."""
+        own = self.own[:, jnp.asarray(members)]
+        shared = jnp.broadcast_to(self.shared[:, None], (self.shared.shape[0], *own.shape[1:]))
+        return jnp.concatenate([shared, own])
+
+
+class Point(NamedTuple):
+    """Residuals and Jacobians at z, one of each for every group."""
+
+    z: Numbers
+    residuals: tuple[Array, ...]  # (m, R, S)
+    jacobians: tuple[Array, ...]  # (m, a + b, R, S)
+
+
+class Arrow(NamedTuple):
+    """Normal equations of S starts."""
+
+    A: Array  # (S, a, a)
+    B: Array  # (S, R, a, b)
+    D: Array  # (S, R, b, b)
+    g: Array  # (S, a)
+    h: Array  # (S, R, b)
+
 
 class Progress(NamedTuple):
-    """S starts of n parameters after some iterations."""
+    """Where the starts are after some iterations."""
 
-    z: Array  # (n, S)
-    residuals: Array  # (m, S)
-    jacobian: Array  # (m, n, S)
-    damping: Array  # (S)
-    step: Array  # (S) relative decrease of the cost at the last accepted step
-
-
-@jax.jit
-def cost(progress: Progress) -> Array:
-    """Half the sum of squares, (S)."""
-    return 0.5 * (progress.residuals**2).sum(0)
+    point: Point
+    cost: Array  # (R, S)
+    damping: Array  # (R, S)
+    done: Array  # (R, S) bool: nothing more to gain
 
 
-@partial(jax.jit, static_argnames="residuals", compiler_options={"xla_cpu_use_fusion_emitters": False})
-def linearise(residuals: Callable, z: Array, data: Any) -> tuple[Array, Array]:
-    """Residuals (m, S) and Jacobian (m, n, S) of `residuals(z, data)`, a column of each start at a time."""
-    units = jnp.eye(z.shape[0], dtype=z.dtype)[:, :, None] * jnp.ones_like(z)[None]
-    value, columns = jax.vmap(lambda unit: jax.jvp(lambda z: residuals(z, data), (z,), (unit,)), out_axes=(None, 1))(
-        units
-    )
-    return value, columns
+def point_at(groups: Sequence[Group], z: Numbers) -> Point:
+    """Residuals and Jacobians of all groups."""
+    pairs = [linearise(group.plan, z.of(group.members), group.data) for group in groups]
+    return Point(z, tuple(r for r, _ in pairs), tuple(j for _, j in pairs))
 
 
-@jax.jit
-def begin(z: Array, residuals: Array, jacobian: Array) -> Progress:
-    """Progress before the first iteration."""
-    residuals = jnp.where(jnp.isfinite(residuals), residuals, jnp.inf)
-    damping = jnp.full(z.shape[1], 1e-2, z.dtype)
-    return Progress(z, residuals, jnp.nan_to_num(jacobian), damping, jnp.ones_like(damping))
+@partial(jax.jit, static_argnames="loss")
+def cost_of(loss: Any, residuals: tuple[Array, ...]) -> Array:
+    """Sum of the loss over all residuals, (S); inf where one is not finite."""
+    return jnp.concatenate([_costs(loss, r) for r in residuals]).sum(0)
 
 
-@jax.jit
-def finished(progress: Progress) -> Array:
-    """True when every start has converged."""
-    return jnp.all((progress.step < 1e-10) | (progress.damping > 1e7))
+def _costs(loss: Any, residuals: Array) -> Array:
+    """Of each record of a group, (R, S)."""
+    total = loss.rho(residuals).sum(0)
+    return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
 
-@jax.jit
-def propose(progress: Progress) -> Array:
-    """Every start after its damped Gauss-Newton step, (n, S)."""
-    jac = jnp.moveaxis(progress.jacobian, -1, 0)  # (S, m, n)
-    normal = jnp.swapaxes(jac, 1, 2) @ jac
-    scale = jnp.maximum(jnp.diagonal(normal, axis1=1, axis2=2), 1e-12)
-    damped = (
-        normal + (progress.damping[:, None] * scale)[:, :, None] * jnp.eye(normal.shape[1], dtype=normal.dtype)[None]
-    )
-    gradient = (jac * progress.residuals.T[:, :, None]).sum(1)
-    step = -jnp.linalg.solve(damped, gradient[:, :, None])[:, :, 0].T
-    return progress.z + jnp.where(jnp.isfinite(step), step, 0.0)
+def arrow(loss: Any, point: Point, members: tuple[tuple[int, ...], ...]) -> Arrow:
+    """Normal equations at a point, each residual weighted as the loss asks."""
+    a = point.z.shared.shape[0]
+    rows, pulls = [], []
+    for r, jac in zip(point.residuals, point.jacobians, strict=True):
+        ok = jnp.isfinite(jac).all((0, 1)) & jnp.isfinite(r).all(0)
+        r, jac = _choose(ok, r, jnp.zeros_like(r)), _choose(ok, jac, jnp.zeros_like(jac))
+        weighted = jac * loss.weight(r)[:, None]
+        rows.append(jnp.einsum("mirs,mjrs->rsij", weighted, jac))
+        pulls.append(jnp.einsum("mirs,mrs->rsi", weighted, r))
+    H, g = (jnp.swapaxes(_in_order(members, parts), 0, 1) for parts in (rows, pulls))
+    return Arrow(H[..., :a, :a].sum(1), H[..., :a, a:], H[..., a:, a:], g[..., :a].sum(1), g[..., a:])
 
 
-@jax.jit
-def accept(progress: Progress, z: Array, residuals: Array, jacobian: Array) -> Progress:
-    """Per start: the new point if it costs less, else the old one with more damping."""
-    new = Progress(z, residuals, jacobian, progress.damping, progress.step)
-    old_cost, new_cost = cost(progress), cost(new)
-    finite = jnp.isfinite(new_cost) & jnp.isfinite(jacobian).all((0, 1))
-    better = finite & (new_cost < old_cost)
-    damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), 1e-9, 1e9)
-    gain = jnp.where(better, (old_cost - new_cost) / jnp.maximum(old_cost, jnp.finfo(z.dtype).tiny), progress.step)
-    z, residuals, jacobian = (jnp.where(better, b, a) for a, b in zip(progress[:3], new[:3], strict=True))
-    return Progress(z, residuals, jacobian, damping, gain)
+def eliminate(eq: Arrow) -> tuple[Array, Array, Array]:
+    """What is left for the shared numbers, (S, a, a) and (S, a), and D^-1 (B^T | h), (S, R, b, a + 1)."""
+    if eq.h.shape[-1] == 0:
+        return eq.A, eq.g, jnp.zeros((*eq.h.shape[:2], 0, eq.g.shape[-1] + 1), eq.g.dtype)
+    right = jnp.concatenate([jnp.swapaxes(eq.B, -1, -2), eq.h[..., None]], axis=-1)
+    solved = jnp.linalg.solve(eq.D, right)
+    taken = jnp.einsum("srab,srbc->sac", eq.B, solved)
+    return eq.A - taken[..., :-1], eq.g - taken[..., -1], solved
 
 
-def least_squares(
-    residuals: Callable, z: np.ndarray, data: Any, iterations: int, report: Callable[[int, Progress], None]
-) -> Progress:
-    """Minimise half the sum of squares of `residuals(z, data)` (m, S) from the starts z (n, S).
+def solve(eq: Arrow) -> tuple[Array, Array]:
+    """The step that the normal equations ask for: of the shared numbers (S, a), and of each record's (S, R, b)."""
+    matrix, right, solved = eliminate(eq)
+    a = eq.g.shape[-1]
+    shared = -jnp.linalg.solve(matrix, right[..., None])[..., 0] if a else right
+    own = -solved[..., -1] - jnp.einsum("srba,sa->srb", solved[..., :-1], shared)
+    return shared, own
 
-    Starts whose residuals are not finite stay where they are, at infinite cost. Stops when every start has
-    converged, its last step gaining less than 1e-10 of its cost or its damping at the limit.
+
+def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
+    """With the diagonal enlarged by damping (S, R), and shared numbers (a,) that are held left where they are."""
+    free = 1.0 - held
+    A = eq.A * (free[:, None] * free[None])[None] + jnp.diag(held)[None]
+    B = eq.B * free[None, None, :, None]
+
+    def enlarged(block: Array, damping: Array) -> Array:
+        scale = jnp.maximum(jnp.diagonal(block, axis1=-2, axis2=-1), 1e-12)
+        unit = jnp.eye(block.shape[-1], dtype=block.dtype).reshape((1,) * (block.ndim - 2) + block.shape[-2:])
+        return block + (damping * scale)[..., None] * unit
+
+    A, D = enlarged(A, damping.max(1)[:, None]), enlarged(eq.D, damping[:, :, None])
+    return Arrow(A, B, D, eq.g * free[None], eq.h)
+
+
+@partial(jax.jit, static_argnames=("loss", "members"), compiler_options={"xla_cpu_use_fusion_emitters": False})
+def update(
+    loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
+) -> tuple[Progress, Numbers]:
+    """The trial where it costs less, else the old point with more damping; and what to try next.
+
+    A start is accepted or not as a whole; where nothing that is shared moves, each record for itself.
     """
-    start = jnp.asarray(z)
-    progress = begin(start, *linearise(residuals, start, data))
-    for count in range(iterations):
-        report(count, progress)
-        trial = propose(progress)
-        progress = accept(progress, trial, *linearise(residuals, trial, data))
-        if bool(finished(progress)):
-            break
-    return progress
+    held = (reach.shared[:, 0] == 0).astype(progress.cost.dtype)
+    alone = held.all()
+    new_cost = _in_order(members, [_costs(loss, r) for r in trial.residuals])
+    whole = new_cost.sum(0) < progress.cost.sum(0)
+    better = jnp.where(alone, new_cost < progress.cost, whole[None])
+    point = _chosen(better, whole, trial, progress.point, members)
+    cost = jnp.where(better, new_cost, progress.cost)
+    damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), 1e-9, 1e9)
+    eq = damped(arrow(loss, point, members), damping.T, held)
+    shared, own = solve(eq)
+    gain = -0.5 * (eq.h * own).sum(-1).T
+    gain = jnp.where(alone, gain, (gain.sum(0) - 0.5 * (eq.g * shared).sum(-1))[None])
+    level = jnp.where(alone, cost, cost.sum(0)[None]) / sum(len(r) for r in point.residuals)
+    done = (gain < SMALL * level) | (damping > STIFF) | ~jnp.isfinite(level)
+    step = Numbers(shared.T, jnp.transpose(own, (2, 1, 0)))
+    step = jax.tree.map(lambda dz, most: jnp.clip(jnp.where(jnp.isfinite(dz), dz, 0.0), -most, most), step, reach)
+    return Progress(point, cost, damping, done), jax.tree.map(jnp.add, point.z, step)
+
+
+def _chosen(better: Array, whole: Array, new: Point, old: Point, members: tuple[tuple[int, ...], ...]) -> Point:
+    """New where better (R, S) by record; shared numbers where the whole start is, (S)."""
+    rows = [better[np.asarray(group)] for group in members]
+    z = Numbers(_choose(whole, new.z.shared, old.z.shared), _choose(better, new.z.own, old.z.own))
+    r = [_choose(ok, a, b) for ok, a, b in zip(rows, new.residuals, old.residuals, strict=True)]
+    jac = [_choose(ok, a, b) for ok, a, b in zip(rows, new.jacobians, old.jacobians, strict=True)]
+    return Point(z, tuple(r), tuple(jac))
+
+
+def best_by_record(groups: Sequence[Group], point: Point, loss: Any) -> np.ndarray:
+    """The start with the lowest cost for each record, (R,)."""
+    members = tuple(group.members for group in groups)
+    return np.asarray(_in_order(members, [_costs(loss, r) for r in point.residuals])).argmin(1)
+
+
+def _choose(better: Array, new: Array, old: Array) -> Array:
+    """By the last axes."""
+    return jnp.where(better.reshape((1,) * (new.ndim - better.ndim) + better.shape), new, old)
+
+
+def _in_order(members: tuple[tuple[int, ...], ...], parts: Sequence[Array]) -> Array:
+    """Rows of all groups in the order of the records."""
+    joined, order = jnp.concatenate(parts), np.argsort(np.concatenate([np.asarray(m) for m in members]))
+    return joined if np.array_equal(order, np.arange(len(order))) else joined[order]
+
+
+def levenberg(
+    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int, reach: Numbers,
+    report: Callable[[int, np.ndarray], None],
+) -> tuple[Point, bool]:  # fmt: skip
+    """The lowest points found from the starts z, and whether the user interrupted.
+
+    Starts whose residuals are not finite stay where they are, at infinite cost. Ends when no start has anything to
+    gain any more.
+
+    Args:
+        reach: the longest step of each number, (a, 1) and (b, 1, 1); a shared number of which it is 0 is held.
+    """
+    members = tuple(group.members for group in groups)
+    return minimise(partial(point_at, groups), members, z, loss, iterations, reach, report)
+
+
+def minimise(
+    at: Callable[[Numbers], Point], members: tuple[tuple[int, ...], ...], z: Numbers, loss: Any, iterations: int,
+    reach: Numbers, report: Callable[[int, np.ndarray], None],
+) -> tuple[Point, bool]:  # fmt: skip
+    """As `levenberg`, of any residuals: `at` gives them and their Jacobians, for groups of the records `members`."""
+    trial = at(z)
+    starts = jnp.zeros_like(z.own, shape=z.own.shape[1:])
+    progress = Progress(trial, starts + jnp.inf, starts + 5e-2, starts > 0)
+    try:
+        for count in range(iterations + 1):
+            progress, z = update(loss, members, progress, trial, reach)
+            report(count, np.asarray(progress.cost.sum(0)))
+            if count == iterations or bool(progress.done.all()):
+                break
+            trial = at(z)
+    except KeyboardInterrupt:
+        return progress.point, True
+    return progress.point, False
+
+
+def least_squares(residuals: Callable[[Array], Array], z: Array, iterations: int = 60) -> tuple[Array, Array]:
+    """Minimise half the sum of squares of any residuals from many starts, each for itself.
+
+    Args:
+        residuals: of S starts z (n, S), (m, S).
+
+    Returns:
+        z (n, S), and the cost (S).
+    """
+
+    @jax.jit
+    def linear(z: Array) -> tuple[Array, Array]:
+        units = jnp.broadcast_to(jnp.eye(len(z), dtype=z.dtype)[:, :, None], (len(z), *z.shape))
+        return residuals(z), jax.vmap(lambda unit: jax.jvp(residuals, (z,), (unit,))[1], out_axes=1)(units)
+
+    def at(z: Numbers) -> Point:
+        r, jac = linear(z.own[:, 0])
+        return Point(z, (r[:, None],), (jac[:, :, None],))
+
+    z = jnp.asarray(z)
+    numbers = Numbers(jnp.zeros((0, z.shape[1]), z.dtype), z[:, None])
+    reach = Numbers(numbers.shared[:, :1], jnp.full((len(z), 1, 1), jnp.inf, z.dtype))
+    point, _ = minimise(at, ((0,),), numbers, Squares(), iterations, reach, lambda count, costs: None)
+    return point.z.own[:, 0], cost_of(Squares(), point.residuals)

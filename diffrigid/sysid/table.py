@@ -6,18 +6,24 @@ from typing import Any
 import numpy as np
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
+SHOWN = 3  # records whose own numbers are in the table
 
 
 def rows(fit: Any) -> list[tuple[str, ...]]:
-    """One row for every number: name, value, interval, unit, note."""
+    """One row for every number: name, value, interval, unit, note. Of records, {0}, {1}, ..., the first three."""
     out: list[tuple[str, ...]] = []
     for p in fit.parameters:
         for index in np.ndindex(p.value.shape):
-            name = p.name if not index else f"{p.name}[{', '.join(map(str, index))}]"
+            record, part = (index[:1], index[1:]) if p.records else ((), index)
+            if record and record[0] >= SHOWN:
+                continue
+            name = p.name + "".join(f"{{{k}}}" for k in record) + (f"[{', '.join(map(str, part))}]" if part else "")
             value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
             digits = _digits(value, low, high)
             interval = f"{low:.{digits}g} .. {high:.{digits}g}"
             out.append((name, f"{value:.{digits}g}", interval, p.unit or "-", p.note))
+        if p.records > SHOWN:
+            out.append((p.name, "...", "", "", f"and {p.records - SHOWN} more records"))
     return out
 
 
@@ -32,24 +38,36 @@ def _digits(value: float, low: float, high: float) -> int:
 def summary(fit: Any) -> str:
     """One line on the starts, the noise and the time."""
     noise = ", ".join(f"{name} {value:.3g}" for name, value in fit.noise.items())
-    return (
-        f"{fit.agree} of {len(fit.costs)} starts agree; noise: {noise}; {fit.seconds:.1f} s"
-        if len(fit.noise) <= 6
-        else f"{fit.agree} of {len(fit.costs)} starts agree; {fit.seconds:.1f} s"
-    )
+    parts = [f"{fit.agree} of {len(fit.costs)} starts agree{_others(fit)}"]
+    parts += [f"noise: {noise}"] if len(fit.noise) <= 6 else []
+    return "; ".join([*parts, f"{fit.seconds:.1f} s"])
+
+
+def _others(fit: Any) -> str:
+    """Where the starts that do not agree ended."""
+    others = fit.costs[fit.agree :]
+    finite = others[np.isfinite(others)]
+    texts = []
+    if len(finite):
+        texts.append(f"{len(finite)} ended at {finite[0] / max(fit.costs[0], 1e-300):.3g} times its cost or more")
+    if len(finite) < len(others):
+        texts.append(f"{len(others) - len(finite)} diverged")
+    return f" ({', '.join(texts)})" if texts else ""
 
 
 def text_table(fit: Any) -> str:
-    """The table in plain text."""
+    """The table in plain text, with the notes under it."""
     table = [HEADER, *rows(fit)]
     widths = [max(len(row[i]) for row in table) for i in range(len(HEADER))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
     rule = "-" * max(map(len, lines))
-    return "\n".join([lines[0], rule, *lines[1:], rule, summary(fit)])
+    return "\n".join([lines[0], rule, *lines[1:], rule, summary(fit), *(f"! {note}" for note in fit.notes)])
 
 
 def html_table(fit: Any) -> str:
     """The table for a notebook."""
     head = "".join(f"<th>{cell}</th>" for cell in HEADER)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows(fit))
-    return f"<table><tr>{head}</tr>{body}</table><p>{html.escape(summary(fit))}</p>"
+    notes = "".join(f"<li>{html.escape(note)}</li>" for note in fit.notes)
+    below = f"<p>{html.escape(summary(fit))}</p>" + (f"<ul>{notes}</ul>" if notes else "")
+    return f"<table><tr>{head}</tr>{body}</table>{below}"

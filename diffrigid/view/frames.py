@@ -17,7 +17,8 @@ from diffrigid.pytree import align, batch_rank
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Shape, Sphere, with_topology
 from diffrigid.state import State, kinetic_energy
 from diffrigid.step import Trajectory
-from diffrigid.sysid.residuals import Column, columns
+from diffrigid.sysid.records import columns
+from diffrigid.sysid.sensors import Part
 from diffrigid.view.contacts import find_contacts
 from diffrigid.view.touch import rotated
 from diffrigid.world import World
@@ -189,29 +190,33 @@ def measured(world: World, data: Mapping[str, Any], t_drawn: np.ndarray, drawn: 
 
     Angles are those of the turn that is nearest to what is drawn, `drawn` (T, K) at t_drawn (T,) [s].
     """
-    t, found = columns(world, data)
+    found, channels = columns(world, data, {})
+    t, used = np.unique(np.concatenate([series.t for series in found])), set()
     table = np.full((len(t), len(world.names), 5 if world.dim == 2 else 10), np.nan)
-    for column in found:
-        for place, values in _places(column, world.dim):
-            table[:, column.row, place] = values
+    for series in found:
+        observer = channels[series.name].observer
+        if isinstance(observer, Part):
+            used.add(observer.body)
+            for place, values in _places(observer.field, series.values, world.dim):
+                table[np.searchsorted(t, series.t), observer.body, place] = values
     if world.dim == 2:
         for row, angle in enumerate(table[:, :, 2].T):
             away = np.interp(t, t_drawn, drawn[:, 5 * row + 2]) - angle
             table[:, row, 2] += 2 * np.pi * np.round(away / (2 * np.pi))
-    used = sorted({column.row for column in found})
-    return {"t": times(t), "bodies": used, "poses": pack(table[:, used].reshape(len(t), -1))}
+    rows = sorted(used)
+    return {"t": times(t), "bodies": rows, "poses": pack(table[:, rows].reshape(len(t), -1))}
 
 
-def _places(column: Column, dim: int):
+def _places(field: str, values: np.ndarray, dim: int):
     """Where a column goes in the table of poses; angular velocities are not drawn."""
-    values, turn = column.measured, 1 if dim == 2 else 4
-    if column.field == "x":
+    turn = 1 if dim == 2 else 4
+    if field == "x":
         yield slice(0, dim), values
-    elif column.field == "v":
+    elif field == "v":
         yield slice(dim + turn, None), values
-    elif column.field == "angle":
+    elif field == "angle":
         yield slice(dim, dim + 1), values
-    elif column.field == "q":
+    elif field == "q":
         yield slice(dim, dim + turn), np.arctan2(values[:, 1:], values[:, :1]) if dim == 2 else values
 
 

@@ -1,0 +1,152 @@
+"""Scenes in TOML files, one to one with what `scene` takes:
+
+gravity = [0.0, -9.81]
+restitution = 0.5
+
+[bodies.ball]
+shape = { disc = { radius = 0.1 } }
+mass = 1.0
+x = [0.0, 1.0]
+
+[statics.floor]
+shape = { half_space = { normal = [0.0, 1.0] } }
+
+[forces]
+air = { drag = { linear = 0.1 } }
+
+[free]                                      # what `fit` may vary
+restitution = { interval = [0, 1] }
+"ball.v" = "real"
+"a.mass = b.mass" = "positive"              # one value for both
+
+[observe]                                   # columns that are not named for what they observe
+tip = { marker = { body = "ball", point = [0.1, 0.0] } }
+
+[fit]                                       # further arguments of `fit`
+starts = 8
+noise = { "ball.x" = 0.001 }
+"""
+
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from diffrigid import forces, joints, shapes, sysid
+from diffrigid.contact import Contact
+from diffrigid.convert import nearest
+from diffrigid.scene import Body, Static, scene
+from diffrigid.state import State
+from diffrigid.world import World
+
+TABLES = ("bodies", "statics", "forces", "joints", "free", "observe", "fit")
+ARGUMENTS = ("gravity", "restitution", "friction", "ignore", "contact")
+OPTIONS = ("starts", "dt", "noise", "widths", "windows", "iterations", "seed")
+KINDS: dict[str, Callable] = {
+    name: getattr(sysid, name)
+    for name in ("interval", "positive", "real", "direction", "rotation", "inertia", "shares")
+}
+SHAPES = {"half_space": shapes.HalfSpace} | {
+    kind.__name__.lower(): kind
+    for kind in (shapes.Disc, shapes.Sphere, shapes.Box, shapes.Capsule, shapes.Polygon, shapes.Hull)
+}
+FORCES = {"spring": forces.SpringDamper} | {
+    kind.__name__.lower(): kind for kind in (forces.Drag, forces.Force, forces.Torque)
+}
+JOINTS = {
+    kind.__name__.lower(): kind
+    for kind in (joints.Revolute, joints.Ball, joints.Weld, joints.Prismatic, joints.Distance)
+}
+OBSERVERS: dict[str, Callable] = {"marker": sysid.Marker, "separation": sysid.Separation}
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """What a file holds."""
+
+    world: World
+    state: State
+    free: dict[Any, Any]
+    observe: dict[str, Any]
+    options: dict[str, Any]  # further arguments of `fit`
+
+
+def read_scene(path: str | Path) -> SceneFile:
+    """The scene of a file, and what is to be fitted in it.
+
+    Raises:
+        ValueError: names the file, the table and the key, what was expected, and the nearest name.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = tomllib.load(file)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path} is no TOML file: {error}") from None
+    for key in data:
+        if key not in (*TABLES, *ARGUMENTS):
+            raise ValueError(f"{path}: unknown key {key!r}: {nearest(key, (*TABLES, *ARGUMENTS))}")
+    bodies = {name: _body(f"{path}: bodies.{name}", Body, entry) for name, entry in data.get("bodies", {}).items()}
+    statics = {name: _body(f"{path}: statics.{name}", Static, entry) for name, entry in data.get("statics", {}).items()}
+    arguments = {key: data[key] for key in ARGUMENTS if key in data}
+    if "contact" in arguments:
+        arguments["contact"] = _made(f"{path}: contact", Contact, arguments["contact"])
+    world, state = scene(
+        {**bodies, **statics},
+        forces={k: _one_of(f"{path}: forces.{k}", FORCES, entry) for k, entry in data.get("forces", {}).items()},
+        joints={k: _one_of(f"{path}: joints.{k}", JOINTS, entry) for k, entry in data.get("joints", {}).items()},
+        **arguments,
+    )
+    for key in data.get("fit", {}):
+        if key not in OPTIONS:
+            raise ValueError(f"{path}: fit.{key} is no option: {nearest(key, OPTIONS)}")
+    return SceneFile(
+        world=world,
+        state=state,
+        free={_paths(key): _kind(f"{path}: free.{key}", entry) for key, entry in data.get("free", {}).items()},
+        observe={k: _observer(f"{path}: observe.{k}", entry) for k, entry in data.get("observe", {}).items()},
+        options=dict(data.get("fit", {})),
+    )
+
+
+def _body(where: str, kind: Any, entry: Any) -> Any:
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"{where} is {entry!r}: expected a table with a shape")
+    shape = entry.get("shape")
+    made = None if shape is None else _one_of(f"{where}.shape", SHAPES, shape)
+    return _made(where, kind, {"shape": made, **{k: v for k, v in entry.items() if k != "shape"}})
+
+
+def _one_of(where: str, kinds: Mapping[str, Callable], entry: Any) -> Any:
+    """A record from { kind = { field = value } }."""
+    if not isinstance(entry, Mapping) or len(entry) != 1:
+        raise ValueError(
+            f"{where} is {entry!r}: expected one kind and its fields, such as {{ {next(iter(kinds))} = {{ }} }}"
+        )
+    ((name, fields),) = entry.items()
+    if name not in kinds:
+        raise ValueError(f"{where}: no {name!r}: {nearest(name, kinds)}")
+    return _made(where, kinds[name], fields)
+
+
+def _made(where: str, kind: Callable, fields: Any) -> Any:
+    try:
+        return kind(**fields)
+    except TypeError as error:
+        raise ValueError(f"{where}: {str(error).removeprefix(kind.__name__ + '.')}") from None
+
+
+def _paths(key: str) -> str | tuple[str, ...]:
+    names = tuple(part.strip() for part in key.split("="))
+    return names if len(names) > 1 else names[0]
+
+
+def _kind(where: str, entry: Any) -> Any:
+    name, arguments = (entry, []) if isinstance(entry, str) else next(iter(entry.items()))
+    if name not in KINDS:
+        raise ValueError(f"{where} is {name!r}: {nearest(name, KINDS)}")
+    return KINDS[name](*(arguments if isinstance(arguments, list) else [arguments]))
+
+
+def _observer(where: str, entry: Any) -> Any:
+    return entry if isinstance(entry, str) else _one_of(where, OBSERVERS, entry)

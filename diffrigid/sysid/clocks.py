@@ -1,0 +1,54 @@
+"""States at times that lie between those of a simulation and may be free."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.flight import launch, state_at
+from diffrigid.state import State
+from diffrigid.step import advance
+from diffrigid.world import World
+
+
+def states_at(world: World, states: State, lengths: Array, times: Array) -> State:
+    """States at times (K, 1 or B) [s] since the first, from those after each step.
+
+    One more step, of the time that is missing, from the state before; so that what happens within it, an impact too, is
+    felt, and the derivative by the time is the velocity. Before the start, the free flight that leads to it.
+
+    Args:
+        states: (S+1, N, ..., B). lengths: (S, B) [s].
+
+    Returns:
+        (K, N, ..., B).
+    """
+    lanes = lengths.shape[1]
+    times = jnp.broadcast_to(times, (times.shape[0], lanes))
+    ends = jnp.concatenate([jnp.zeros_like(lengths[:1]), jnp.cumsum(lengths, axis=0)])
+    ends, count = lax.stop_gradient(ends), len(lengths)
+    before = (lax.stop_gradient(times)[:, None] > ends[None]).sum(1) - 1  # strictly: no step has no length
+    before = jnp.clip(before, 0, count)
+    missing = times - jnp.take_along_axis(ends, before, axis=0)
+    late = missing > 0
+
+    def flat(leaf: Array) -> Array:  # (K, N, ..., B) to (N, ..., K B)
+        leaf = jnp.moveaxis(leaf, 0, -2)
+        return leaf.reshape(*leaf.shape[:-2], -1)
+
+    def again(leaf: Array) -> Array:
+        return leaf if leaf.shape[-1] == 1 else jnp.tile(leaf, len(times))
+
+    def pick(leaf: Array) -> Array:
+        return flat(jnp.take_along_axis(leaf, before.reshape(len(before), *[1] * (leaf.ndim - 2), -1), axis=0))
+
+    start, worlds = jax.tree.map(pick, states), jax.tree.map(again, world)
+    dt = jnp.where(late, missing, lengths[0]).reshape(-1)
+    after = advance(worlds, start, dt, None)
+    flight = launch(worlds, start, None, jnp.zeros((start.x.shape[0], dt.shape[0]), dt.dtype), dt)
+    earlier = state_at(flight, jnp.where(late, 0.0, missing).reshape(-1))
+
+    def choose(a: Array, b: Array) -> Array:
+        a = jnp.where(late.reshape((1,) * (a.ndim - 1) + (-1,)), a, b)
+        return jnp.moveaxis(a.reshape(*a.shape[:-1], len(times), lanes), -2, 0)
+
+    return jax.tree.map(choose, after, earlier)

@@ -1,0 +1,31 @@
+"""`python -m diffrigid fit scene.toml data.csv [more.csv ...]`: a fit from files."""
+
+import argparse
+from collections.abc import Sequence
+
+from diffrigid.scene_file import read_scene
+from diffrigid.sysid.fit import fit
+from diffrigid.sysid.summary import load_fit
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Fit, print the table, and write it if asked to. Files of data are records of one scene."""
+    parser = argparse.ArgumentParser(prog="python -m diffrigid fit", description=main.__doc__)
+    parser.add_argument("scene", help="TOML file, see diffrigid/scene_file.py")
+    parser.add_argument("data", nargs="+", help="CSV files: columns t, ball.x[0], ball.x[1], ball.angle, ...")
+    parser.add_argument("--out", metavar="FILE", help="write the result as JSON")
+    parser.add_argument("--resume", metavar="FILE", help="start from a result")
+    options = parser.parse_args(arguments)
+    try:
+        read = read_scene(options.scene)
+        observations = options.data if len(options.data) > 1 else options.data[0]
+        resume = None if options.resume is None else load_fit(options.resume)
+        found = fit(
+            read.world, read.state, observations, free=read.free, observe=read.observe, resume=resume, **read.options
+        )  # fmt: skip
+    except (ValueError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: {error}\n")
+    print(found)
+    if options.out:
+        print(f"written to {found.save(options.out)}")
+    return 0

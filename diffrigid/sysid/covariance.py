@@ -1,0 +1,132 @@
+"""How far fitted numbers may be off: covariances of z from the Jacobian, from clusters of residuals, and by resampling.
+
+Each is a function of a `Linear` and returns an `Uncertainty`: of the numbers that all records share. That of a record's
+own numbers follows from it (`own_covariance`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+BLOCKS = 20  # pieces of time that stand for independent runs where there is only one record
+DRAWS = 2000  # of the bootstrap
+MANY = 1e6  # degrees of freedom: Student's distribution is the normal one
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A fit about its best point: residuals in standard deviations and their derivatives, record by record.
+
+    With a robust loss the residuals are rho'(r) over the mean of rho''(r): what least squares would have to see to move
+    as the fit does. Source: Huber and Ronchetti, Robust Statistics, 2009, section 7.6.
+    """
+
+    rows: tuple[np.ndarray, ...]  # of each record, (m,) residuals, those missing left out
+    slopes: tuple[np.ndarray, ...]  # of each record, (m, a + b)
+    times: tuple[np.ndarray, ...]  # of each record, (m,) [s]; NaN for a prior
+    shared: int  # a
+    variance: float  # of the residuals: 1, or what it is with a robust loss
+    estimated: bool  # the noise comes from the residuals
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance of the shared numbers, (a, a), and the degrees of freedom of Student's t for the intervals."""
+
+    covariance: np.ndarray
+    freedom: float
+
+
+Intervals = Callable[[Linear], Uncertainty]
+
+
+def from_jacobian(linear: Linear) -> Uncertainty:
+    """(J^T J)^-1: right where residuals are independent and the model holds. The usual one."""
+    numbers = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
+    freedom = max(sum(map(len, linear.rows)) - numbers, 1) if linear.estimated else MANY
+    return Uncertainty(linear.variance * inverse(information(linear)), float(freedom))
+
+
+def information(linear: Linear) -> np.ndarray:
+    """J^T J of the shared numbers, (a, a), those of each record eliminated."""
+    return np.sum(_blocks(linear)[0], axis=0)
+
+
+def sandwich(linear: Linear) -> Uncertainty:
+    """From how far each record pulls: right where the model is wrong, or residuals go together within a record.
+
+    Leaves out each record in turn, to first order; with one record, each of 20 pieces of its time, which is right if
+    residuals of different pieces are independent. Source: jackknife of clusters, CR3 of Bell and McCaffrey 2002.
+    """
+    H, pull = _clusters(linear)
+    total, count = sum(H), len(H)
+    moved = np.stack([inverse(total - h) @ p for h, p in zip(H, pull, strict=True)])
+    moved = moved - moved.mean(0)
+    return Uncertainty((count - 1) / count * moved.T @ moved, float(count - 1))
+
+
+def bootstrap(linear: Linear) -> Uncertainty:
+    """Spread of the fit over clusters drawn again with replacement, 2000 times, one Gauss-Newton step each."""
+    H, pull = _clusters(linear)
+    count = len(H)
+    times = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=DRAWS).astype(float)
+    matrices, pulls = np.einsum("dk,kab->dab", times, np.stack(H)), np.einsum("dk,ka->da", times, np.stack(pull))
+    moved = np.stack([inverse(h) @ p for h, p in zip(matrices, pulls, strict=True)])
+    return Uncertainty(np.atleast_2d(np.cov(moved.T)) * count / max(count - 1, 1), float(count - 1))
+
+
+def own_covariance(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
+    """Covariance (b, b) of a record's own numbers, given that of the shared ones."""
+    shared_part, own = np.split(linear.slopes[record], [linear.shared], axis=1)
+    D = inverse(own.T @ own)
+    across = D @ own.T @ shared_part
+    return linear.variance * D + across @ shared @ across.T
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Inverse of a symmetric matrix >= 0, scaled first so that units do not matter; pseudo-inverse where singular."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return np.linalg.pinv(matrix / scale / scale[:, None], rcond=1e-13, hermitian=True) / scale / scale[:, None]
+
+
+def student_quantile(freedom: float, probability: float = 0.975) -> float:
+    """Quantile of Student's t. With t = sqrt(nu) tan(u), the density of u is proportional to cos(u)^(nu - 1)."""
+    if freedom > 1000:
+        return 1.959964 if probability == 0.975 else student_quantile(1000.0, probability)
+    u = np.linspace(0.0, np.pi / 2, 200001)[:-1]
+    density = np.cos(u) ** (freedom - 1.0)
+    half = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    if freedom < 2:  # the density does not end at zero: cos^0, all of it belongs to the total
+        half = half / (half[-1] + 0.5 * density[-1])
+    return float(np.sqrt(freedom) * np.tan(np.interp(2 * probability - 1, half / half[-1], u)))
+
+
+def _blocks(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """For each record: information on the shared numbers, and their pull, with its own numbers eliminated."""
+    found = [eliminated(linear, k) for k in range(len(linear.rows))]
+    return [J.T @ J for J, _ in found], [-J.T @ r for J, r in found]
+
+
+def _clusters(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """As `_blocks`, for pieces of time if there is one record; at least two clusters."""
+    if len(linear.rows) > 1:
+        return _blocks(linear)
+    J, r = eliminated(linear, 0)
+    t = linear.times[0]
+    order = np.argsort(np.where(np.isfinite(t), t, np.nanmin(t)), kind="stable")
+    pieces = np.array_split(order, min(BLOCKS, max(len(order) // 4, 2)))
+    return [J[p].T @ J[p] for p in pieces], [-J[p].T @ r[p] for p in pieces]
+
+
+def eliminated(linear: Linear, record: int) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes by the shared numbers (m, a) and residuals of a record, freed of what its own numbers can explain."""
+    J, r = linear.slopes[record], linear.rows[record]
+    own = J[:, linear.shared :]
+    if own.shape[1] == 0:
+        return J, r
+    scale = np.sqrt(np.maximum((own**2).sum(0), 1e-300))
+    basis, sizes, _ = np.linalg.svd(own / scale, full_matrices=False)
+    basis = basis[:, sizes > 1e-10 * max(sizes[0], 1e-300)]
+    shared = J[:, : linear.shared]
+    return shared - basis @ (basis.T @ shared), r - basis @ (basis.T @ r)

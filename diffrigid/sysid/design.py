@@ -1,0 +1,160 @@
+"""Design of experiments: what a planned record would tell, and the launch that tells most."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid.state import State
+from diffrigid.sysid.covariance import MANY, Linear, from_jacobian, inverse
+from diffrigid.sysid.diagnosis import blind_directions, coordinates
+from diffrigid.sysid.levenberg import point_at
+from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.parameters import Slot, knows, make_slots, put, reference
+from diffrigid.sysid.records import Record
+from diffrigid.sysid.result import interval_of, unit_of
+from diffrigid.sysid.setup import Problem, first_numbers, linear_of, make_problem, make_starts, scene_of
+from diffrigid.sysid.summary import Parameter
+from diffrigid.world import World
+
+NUDGE = 1e-3  # of z, for differences
+SHRINK, GROW = 0.5, 1.5  # of the length of a step that loses, or gains
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A planned record: its scene, what its launch is, and the intervals that it would give."""
+
+    world: World
+    state: State
+    values: dict[str, np.ndarray]  # of what was varied
+    parameters: tuple[Parameter, ...]  # at their present values, with the interval to expect
+    score: float  # mean logarithm of the standard deviations of z; -1 is intervals e times as narrow
+
+
+def expected_intervals(
+    world: World, state: State, planned: Mapping[str, Any], *, free: Mapping[Any, Any], noise: Mapping[str, float],
+    observe: Mapping[str, Any] | None = None, dt: float | None = None,
+) -> tuple[Parameter, ...]:  # fmt: skip
+    """Intervals that a record would give if the world were as it is given: the Cramer-Rao bound.
+
+    Args:
+        planned: "t" and the columns, with None for values, or NaN where nothing will be measured.
+        noise: standard deviation of every column.
+    """
+    problem = _problem(world, state, [state], planned, free, noise, observe, dt)
+    return _parameters(problem, 0, _linears(problem)[0])
+
+
+def blind_spots(
+    world: World, state: State, observations: Any, *, free: Mapping[Any, Any], noise: Mapping[str, Any] | None = None,
+    observe: Mapping[str, Any] | None = None, dt: float | None = None,
+) -> tuple[str, ...]:  # fmt: skip
+    """What these observations cannot tell, in words, before any fit: at the values of the scene. Arguments of `fit`."""
+    problem = make_problem(world, state, observations, free=free, noise=noise, observe=observe, dt=dt)
+    linear = linear_of(problem, point_at(problem.groups, make_starts(problem, 1, 0)), 0, Squares(), False)
+    slots = (*problem.shared, *problem.own)
+    scenes = [scene_of(run) for run in problem.runs]
+    having = [next(s for s in scenes if all(knows(s, path) for path in slot.paths)) for slot in slots]
+    places = coordinates(slots, [np.asarray(reference(*pair)) for pair in zip(slots, having, strict=True)])
+    return tuple(blind.words for blind in blind_directions(linear, places))
+
+
+def best_launch(
+    world: World, state: State, planned: Mapping[str, Any], *, free: Mapping[Any, Any], noise: Mapping[str, float],
+    vary: Mapping[Any, Any], starts: int = 8, steps: int = 20, seed: int = 0,
+    observe: Mapping[str, Any] | None = None, dt: float | None = None,
+) -> Launch:  # fmt: skip
+    """The launch whose record would give the narrowest intervals (D-optimal), by gradients from several starts.
+
+    Args:
+        vary: what can be chosen of the initial state, as `free`: {"ball.v": interval(-3, 3)}.
+
+    The gradient of the information is by central differences of exact Jacobians, all launches in one batch.
+    """
+    slots, _ = make_slots(vary, [scene_of(_problem(world, state, [state], planned, free, noise, observe, dt).runs[0])])
+    count = sum(slot.size for slot in slots)
+    lanes = starts * (2 * count + 1)
+    problem = _problem(world, state, [state] * lanes, planned, free, noise, observe, dt)
+    random, scene = np.random.default_rng(seed), scene_of(problem.runs[0])
+
+    def first(k: int) -> np.ndarray:
+        about = [np.asarray(reference(slot, scene)) for slot in slots]
+        pairs = zip(slots, about, strict=True)
+        return np.concatenate([s.kind.draw(a, random) if k else s.kind.unbounded(a) for s, a in pairs])
+
+    def scores(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of launches u (starts, count), and their gradients."""
+        shifts = np.concatenate([np.zeros((1, count)), NUDGE * np.eye(count), -NUDGE * np.eye(count)])
+        points = (u[:, None] + shifts[None]).reshape(lanes, count)
+        states = [put(slots, scene, jnp.asarray(p, scene.state.x.dtype)).state for p in points]
+        found = _problem(world, state, states, planned, free, noise, observe, dt)
+        value = np.array([_score(linear) for linear in _linears(found)]).reshape(starts, -1)
+        return value[:, 0], (value[:, 1 : count + 1] - value[:, count + 1 :]) / (2 * NUDGE)
+
+    u = np.stack([first(k) for k in range(starts)])
+    length = np.full(starts, 0.3)
+    value, slope = scores(u)
+    for _ in range(steps):
+        size = np.sqrt((slope**2).sum(1, keepdims=True))
+        trial = u - length[:, None] * slope / np.maximum(size, 1e-12)
+        new, new_slope = scores(trial)
+        better = new < value
+        u, slope = np.where(better[:, None], trial, u), np.where(better[:, None], new_slope, slope)
+        value, length = np.where(better, new, value), length * np.where(better, GROW, SHRINK)
+    best = put(slots, scene, jnp.asarray(u[np.argmin(value)], scene.state.x.dtype))
+    values = {slot.name: np.asarray(reference(slot, best)) for slot in slots}
+    found = expected_intervals(best.world, best.state, planned, free=free, noise=noise, observe=observe, dt=dt)
+    return Launch(best.world, best.state, values, found, float(value.min()))
+
+
+def _problem(world, state, states: Sequence[State], planned, free, noise, observe, dt) -> Problem:
+    t = np.asarray(planned["t"], float)
+    names = [name for name in planned if name != "t"]
+    if missing := [name for name in names if name not in (noise or {})]:
+        raise ValueError(f"noise: expected a standard deviation for every planned column, {missing[0]!r} has none")
+    flat = {name: np.zeros(_shape(world, name, planned[name], t, observe)) for name in names}
+    columns = {n: v if planned[n] is None else np.where(np.isfinite(planned[n]), 0.0, np.nan) for n, v in flat.items()}
+    records = [Record({"t": t, **columns}, state=s) for s in states]
+    return make_problem(world, state, records, free=free, noise=noise, observe=observe, dt=dt)
+
+
+def _shape(world: World, name: str, values: Any, t: np.ndarray, observe: Any) -> tuple[int, ...]:
+    if values is not None:
+        return np.shape(values)
+    field = name.rsplit(".", 1)[-1] if name not in (observe or {}) else "x"
+    sizes = {"x": world.dim, "v": world.dim, "q": 2 * world.dim - 2, "w": 2 * world.dim - 3}
+    return (len(t), sizes.get(field, 1))
+
+
+def _linears(problem: Problem) -> list[Linear]:
+    """Each record alone."""
+    point = point_at(problem.groups, make_starts(problem, 1, 0))
+    linear = linear_of(problem, point, 0, Squares(), False)
+    rows = zip(linear.rows, linear.slopes, linear.times, strict=True)
+    return [Linear((r,), (J,), (t,), linear.shared, 1.0, False) for r, J, t in rows]
+
+
+def _score(linear: Linear) -> float:
+    """Mean logarithm of the standard deviations along the axes of the ellipsoid."""
+    information = inverse(from_jacobian(linear).covariance)
+    sign, logarithm = np.linalg.slogdet(information)
+    return float(-0.5 * logarithm / len(information)) if sign > 0 and np.isfinite(logarithm) else MANY
+
+
+def _parameters(problem: Problem, record: int, linear: Linear) -> tuple[Parameter, ...]:
+    covariance, (z, _) = from_jacobian(linear).covariance, first_numbers(problem)
+    out, first = [], 0
+    for slot in problem.shared:
+        rows = slice(first, first + slot.size)
+        out.append(_parameter(slot, z[rows], covariance[rows, rows], problem, record))
+        first += slot.size
+    return tuple(out)
+
+
+def _parameter(slot: Slot, z: np.ndarray, covariance: np.ndarray, problem: Problem, record: int) -> Parameter:
+    about = reference(slot, scene_of(problem.runs[record]))
+    value, low, high = interval_of(slot, z, covariance, about, 1.959964)
+    return Parameter(slot.name, value, low, high, unit_of(slot), "expected")

@@ -1,0 +1,188 @@
+"""What the data cannot tell, in words, and whether residuals are as noise should be."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffrigid.sysid.covariance import Linear, eliminated
+from diffrigid.sysid.free import Free
+
+ALIKE = 1e-8  # [-] eigenvalue of the scaled information below which effects are the same: a correlation of 1 - 1e-8
+SMALL = 0.05  # [-] parts of a direction below this of its largest are rounding
+LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that says nothing of it
+RARE = 1e-3  # chance below which residuals are not taken for noise
+LAGS = 5  # frames over which residuals are compared with themselves
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One number of z: the parameter that it belongs to."""
+
+    name: str
+    path: str
+    logarithmic: bool  # z is the logarithm of the parameter
+    scale: float  # a large change
+
+
+@dataclass(frozen=True)
+class Blind:
+    """Numbers that can change together without any effect on what was measured."""
+
+    direction: np.ndarray  # (n,) of z
+    names: tuple[str, ...]
+    words: str
+
+
+def coordinates(slots: Sequence, references: Sequence[np.ndarray]) -> list[Coordinate]:
+    """The numbers of z, in order."""
+    out = []
+    for slot, reference in zip(slots, references, strict=True):
+        log = isinstance(slot.kind, Free) and slot.kind.low == 0 and not np.isfinite(slot.kind.high)
+        sizes = slot.kind.scale(reference)
+        for k in range(slot.size):
+            name = slot.name if slot.size == 1 else f"{slot.name}[{k}]"
+            out.append(Coordinate(name, slot.name, log, float(sizes[k])))
+    return out
+
+
+def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[Blind]:
+    """Directions of z that nothing measured depends on: of the shared numbers with those of the first record.
+
+    The columns of the Jacobian are scaled to length one; a direction in which they cancel is one that is not seen.
+    """
+    J = _first_record(linear, len(coordinates))
+    sizes = np.sqrt((J**2).sum(0))
+    top = max(sizes.max(), 1e-300)
+    unseen = sizes < 1e-12 * top
+    out = []
+    for path in dict.fromkeys(c.path for c in coordinates):
+        mine = np.array([c.path == path for c in coordinates])
+        if (unseen & mine).any():
+            names = [c.name for c, off in zip(coordinates, unseen & mine, strict=True) if off]
+            label = path if unseen[mine].all() else ", ".join(names)
+            words = f"nothing that was measured depends on {label}"
+            out.append(Blind((unseen & mine).astype(float), (path,), words))
+    seen = np.flatnonzero(~unseen)
+    scaled = J[:, seen] / sizes[seen]
+    values, vectors = np.linalg.eigh(scaled.T @ scaled) if len(seen) else (np.zeros(0), np.zeros((0, 0)))
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value < ALIKE * max(values.max(), 1e-300):
+            direction = np.zeros(len(coordinates))
+            direction[seen] = vector / sizes[seen]
+            out.append(_blind(direction, coordinates))
+    return out
+
+
+def _first_record(linear: Linear, numbers: int) -> np.ndarray:
+    """Slopes by the shared numbers and the own ones of the first record, rows of all records.
+
+    Rows of the other records are freed of what their own numbers can explain.
+    """
+    others = [eliminated(linear, k)[0] for k in range(1, len(linear.rows))]
+    wide = [np.concatenate([rest, np.zeros((len(rest), numbers - linear.shared))], axis=1) for rest in others]
+    return np.concatenate([linear.slopes[0], *wide])
+
+
+def _blind(direction: np.ndarray, coordinates: Sequence[Coordinate]) -> Blind:
+    direction = np.where(np.abs(direction) < SMALL * np.abs(direction).max(), 0.0, direction)
+    parts = [(c, v) for c, v in zip(coordinates, direction, strict=True) if v != 0]
+    names = tuple(dict.fromkeys(c.path for c, _ in parts))
+    return Blind(direction, names, _words(parts))
+
+
+def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
+    """What is seen of a few numbers that change together, and what is not."""
+    names = [c.name for c, _ in parts]
+    steps = np.array([v for _, v in parts])
+    steps = steps / steps[np.argmax(np.abs(steps))]
+    if len(parts) == 1:
+        return f"nothing that was measured depends on {names[0]}"
+    if all(c.logarithmic for c, _ in parts):
+        if len(parts) == 2:
+            power = steps[0] / steps[1]  # a^p with b^1 move together: a / b^p is seen
+            if abs(power) < 1:
+                names, power = names[::-1], 1 / power
+            exponent = "" if abs(abs(power) - 1) < 0.02 else f"^{abs(power):.3g}"
+            what = "ratio" if power > 0 and not exponent else "product" if not exponent else "combination"
+            return f"only the {what} {names[0]} {'/' if power > 0 else '*'} {names[1]}{exponent} is seen"
+        if np.all(np.abs(steps - 1) < 0.02):
+            return f"only the ratios of {', '.join(names)} are seen: all times one factor is the same motion"
+    changes = ", ".join(
+        f"{c.name} {s:+.2g}{' (relative)' if c.logarithmic else ''}" for (c, _), s in zip(parts, steps, strict=True)
+    )
+    return f"these change together without effect: {changes}"
+
+
+def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate]) -> list[str]:
+    """Shared parameters of which the data say next to nothing, though something."""
+    deviation = np.sqrt(np.diag(covariance))
+    hidden = [(c, s) for c, s in zip(coordinates, deviation, strict=True) if LARGE * c.scale < s < np.inf]
+    known = [f"a factor {np.exp(s):.2g}" if c.logarithmic else f"+- {s:.2g}" for c, s in hidden]
+    return [f"{c.name} is hardly seen: known to {text}" for (c, _), text in zip(hidden, known, strict=True)]
+
+
+def correlations(covariance: np.ndarray) -> np.ndarray:
+    """Correlation matrix (n, n); rows of what has no variance are zero."""
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(deviation > 0, deviation, np.inf)
+    return covariance / safe / safe[:, None]
+
+
+# ---- residuals
+
+
+def whiteness(series: Sequence[np.ndarray]) -> float:
+    """Chance that residuals that go as much with those just before them come from independent noise.
+
+    The autocorrelations of n numbers are normal with variance 1 / n about 0; those over 5 lags are summed, over all
+    series. One-sided: what a model misses makes neighbours alike, while the numbers that are fitted make them a little
+    unlike, so that many short series of noise are not doubted. NaN is left out of the products.
+    """
+    total, count = 0.0, 0
+    for r in series:
+        n = int(np.isfinite(r).sum())
+        if n > 3 * LAGS and np.nanmax(np.abs(r)) > 0:
+            r = np.nan_to_num(r)
+            total += np.sqrt(n) * sum((r[k:] * r[:-k]).sum() for k in range(1, LAGS + 1)) / (r**2).sum()
+            count += LAGS
+    return 1.0 if count == 0 else 0.5 * math.erfc(total / math.sqrt(2.0 * count))
+
+
+def normality(r: np.ndarray) -> float:
+    """Chance of such skewness and tails in normal noise. Source: Jarque and Bera 1987."""
+    r = r[np.isfinite(r)]
+    if len(r) < 20 or np.std(r) == 0:
+        return 1.0
+    u = (r - r.mean()) / r.std()
+    statistic = len(r) / 6 * ((u**3).mean() ** 2 + 0.25 * ((u**4).mean() - 3.0) ** 2)
+    return float(np.exp(-0.5 * statistic))  # chi^2 with two degrees of freedom
+
+
+def doubts(series: Sequence[np.ndarray], expected: float | None) -> list[str]:
+    """Why intervals that take residuals as independent normal noise should not be believed; empty if they may be.
+
+    Args:
+        series: residuals in standard deviations, one array a component of a column, in order of time.
+        expected: mean square that they should have; None if the noise was estimated from them.
+    """
+    out = []
+    if (p := whiteness(series)) < RARE:
+        out.append(f"residuals follow each other (p = {p:.1g}): the model misses something, intervals are too narrow")
+    joined = np.concatenate([r[np.isfinite(r)] for r in series])
+    if (p := normality(joined)) < RARE:
+        out.append(f"residuals are not normal (p = {p:.1g}): a robust loss, huber() or student(), minds the tails less")
+    if expected is not None and len(joined) and (ratio := float(np.sqrt(np.mean(joined**2) / expected))) > 1.2:
+        out.append(f"residuals are {ratio:.2g} times the noise that was given")
+    return out
+
+
+def infinite_where_blind(covariance: np.ndarray, blind: Sequence[Blind], shared: int) -> np.ndarray:
+    """Covariance with infinite variance for shared numbers that take part in a direction that is not seen."""
+    parts = np.zeros(shared, bool)
+    for b in blind:
+        parts |= b.direction[:shared] != 0
+    covariance = covariance.copy()
+    covariance[parts, parts] = np.inf
+    return covariance

@@ -1,0 +1,64 @@
+"""Figures of a fit, with matplotlib: each returns a `matplotlib.figure.Figure`."""
+
+from typing import Any
+
+import numpy as np
+
+from diffrigid.sysid.diagnosis import correlations
+from diffrigid.sysid.profile import Profile
+from diffrigid.sysid.result import Fit
+
+
+def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ImportError('figures need matplotlib: pip install "diffrigid[notebook]"') from None
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots()
+
+
+def residual_figure(fit: Fit, record: int = 0) -> Any:
+    """Residuals of a record over time, in standard deviations."""
+    figure, axes = _axes()
+    for series in fit.problem.runs[record].series:
+        values = fit.residuals[record][series.name][: len(series.t)]
+        for k in range(values.shape[1]):
+            label = series.name if values.shape[1] == 1 else f"{series.name}[{k}]"
+            axes.plot(series.t, values[:, k], ".", label=label)
+    for level in (-2, 0, 2):
+        axes.axhline(level, color="0.7", linewidth=0.8)
+    axes.set(xlabel="time [s]", ylabel="residual [standard deviations]")
+    axes.legend(fontsize="small")
+    return figure
+
+
+def cost_figure(fit: Fit) -> Any:
+    """Cost at which each start ended, lowest first."""
+    figure, axes = _axes()
+    axes.semilogy(np.arange(1, len(fit.costs) + 1), np.where(np.isfinite(fit.costs), fit.costs, np.nan), "o")
+    axes.set(xlabel="start", ylabel="cost")
+    return figure
+
+
+def correlation_figure(fit: Fit) -> Any:
+    """Correlations of the shared numbers."""
+    figure, axes = _axes(5.0, 4.2)
+    names = [
+        slot.name if slot.size == 1 else f"{slot.name}[{k}]" for slot in fit.problem.shared for k in range(slot.size)
+    ]
+    image = axes.imshow(correlations(fit.covariance), vmin=-1, vmax=1, cmap="RdBu")
+    axes.set_xticks(range(len(names)), names, rotation=90)
+    axes.set_yticks(range(len(names)), names)
+    figure.colorbar(image)
+    return figure
+
+
+def profile_figure(found: Profile) -> Any:
+    """Rise of the cost about the best value, and the level of the 95 % interval."""
+    figure, axes = _axes()
+    axes.plot(found.values, found.rise, "o-")
+    axes.axhline(found.level, color="0.5", linewidth=0.8)
+    axes.axvspan(found.low, found.high, alpha=0.15)
+    axes.set(xlabel=found.name, ylabel="rise of the cost")
+    return figure

@@ -1,0 +1,126 @@
+"""Free parameters of a scene: where each is, and how a vector z of numbers is put into it.
+
+Numbers that all records share come first in z, then those of which each record has its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from diffrigid import paths
+from diffrigid.convert import nearest
+from diffrigid.state import State
+from diffrigid.sysid.free import Chart, Each, Free, Kind, Prior
+from diffrigid.sysid.sensors import Channel, channel_paths, read_channel, write_channel
+from diffrigid.world import World
+
+
+class Scene(NamedTuple):
+    """What parameters are part of."""
+
+    world: World
+    state: State
+    channels: dict[str, Channel]
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One free parameter."""
+
+    name: str
+    paths: tuple[str, ...]
+    kind: Kind
+    size: int  # numbers of z
+    prior: Prior | None = None
+
+    @property
+    def joint(self) -> bool:
+        """True if the paths are parts of one vector, not names of one value."""
+        return isinstance(self.kind, Chart) and self.kind.name == "shares"
+
+
+def read(scene: Scene, path: str) -> Array:
+    """Value of a parameter of the world, the initial state, or a column."""
+    if path in channel_paths(scene.channels):
+        return read_channel(scene.channels, path)
+    return paths.read(scene.world, scene.state, path)
+
+
+def write(scene: Scene, path: str, value: Array) -> Scene:
+    """The scene with one parameter changed."""
+    if path in channel_paths(scene.channels):
+        return scene._replace(channels=write_channel(scene.channels, path, value))
+    world, state = paths.write(scene.world, scene.state, path, value)
+    return scene._replace(world=world, state=state)
+
+
+def knows(scene: Scene, path: str) -> bool:
+    """True if the scene has such a parameter."""
+    return path in channel_paths(scene.channels) or path in paths._catalogue(scene.world)
+
+
+def reference(slot: Slot, scene: Scene) -> Array:
+    """Value of a slot's parameter in a scene."""
+    if slot.joint:
+        return jnp.stack([jnp.reshape(read(scene, path), ()) for path in slot.paths])
+    return read(scene, slot.paths[0])
+
+
+def split(slots: Sequence[Slot], z: Any) -> list[Any]:
+    """z (n, ...) in pieces, one for each slot."""
+    ends = np.cumsum([0, *(slot.size for slot in slots)])
+    return [z[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
+    """The scene with the parameters for z (n,)."""
+    used = [(slot, piece) for slot, piece in zip(slots, split(slots, z), strict=True) if slot.paths]
+    values = [slot.kind.value(piece, reference(slot, scene)) for slot, piece in used]
+    for (slot, _), value in zip(used, values, strict=True):
+        for k, path in enumerate(slot.paths):
+            scene = write(scene, path, value[k] if slot.joint else value)
+    return scene
+
+
+def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[Slot, ...], tuple[Slot, ...]]:
+    """The parameters that all records share, and those of which each has its own.
+
+    Raises:
+        ValueError: nothing is free, a kind is none, or a path is in no scene.
+    """
+    if not isinstance(free, Mapping) or not free:
+        raise ValueError('free: nothing to fit; give paths, for example {"restitution": interval(0, 1)}')
+    shared: list[Slot] = []
+    own: list[Slot] = []
+    for key, kind in free.items():
+        names = (key,) if isinstance(key, str) else tuple(key)
+        several = isinstance(kind, Each)
+        kind = kind.kind if isinstance(kind, Each) else kind
+        known = kind if isinstance(kind, Prior) else None
+        kind = kind.kind if isinstance(kind, Prior) else kind
+        if not isinstance(kind, Free | Chart):
+            raise ValueError(
+                f"free[{key!r}]: expected interval(low, high), positive(), real() or another kind, got {kind!r}"
+            )
+        having = [scene for scene in scenes if all(knows(scene, name) for name in names)]
+        if not having or several and len(having) < len(scenes):
+            _refuse(names, having, scenes)
+        slot = Slot(" = ".join(names), names, kind, 0, known)
+        size = kind.size(reference(slot, having[0]).shape)
+        name = slot.name.replace(" = ", " : ") if slot.joint else slot.name
+        (own if several else shared).append(Slot(name, names, kind, size, known))
+    return tuple(shared), tuple(own)
+
+
+def _refuse(names: tuple[str, ...], having: Sequence[Scene], scenes: Sequence[Scene]) -> None:
+    for name in names:
+        lacking = [scene for scene in scenes if not knows(scene, name)]
+        if lacking:
+            catalogue = [*channel_paths(lacking[0].channels), *paths._catalogue(lacking[0].world)]
+            where = "this world" if not having else "the scene of every record, as a parameter of `each` has to be"
+            raise ValueError(f"free: no parameter {name!r} in {where}: {nearest(name, catalogue)}")
+    raise ValueError(f"free: no scene has all of {names}: tie only what is in one scene")

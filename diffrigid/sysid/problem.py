@@ -1,0 +1,248 @@
+"""From z to residuals: the records in arrays, and the simulation of all of them at once.
+
+    z -> parameters -> scene of every record -> states -> what each column reads -> weighted residuals
+
+Records of one structure are one group: they are padded to one length and lie, like the starts and the directions of the
+Jacobian, side by side on the last axis, so that what is compiled does not grow with their number. All measured numbers
+are arguments of what is compiled: another record of the same shape costs no compilation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from diffrigid import paths
+from diffrigid.step import aligned, scan_steps
+from diffrigid.sysid.clocks import states_at
+from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
+from diffrigid.sysid.records import SAME, Run, Series
+from diffrigid.sysid.sensors import Part, difference
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is compiled for a group of records."""
+
+    slots: tuple[Slot, ...]  # shared ones first; those that no scene of the group has are without paths
+    clocked: tuple[str, ...]  # columns whose times are shifted
+    priors: tuple[float, ...]  # of each slot: 1 / sqrt(records that share it)
+
+
+class Data(NamedTuple):
+    """The records of a group in arrays, with a last axis of R records, or of 1 where they are alike."""
+
+    scene: Scene
+    lengths: Any  # (S, R) [s] of the steps
+    rows: dict[str, Array]  # (K, R) state of each row of a column
+    times: dict[str, Array]  # (K, R) [s] since the start, of columns that are clocked
+    measured: dict[str, Array]  # (K, size, R)
+    weights: dict[str, Array]  # (K, size of the residual, R) 1 / standard deviation, 0 where missing
+    width: Any  # () [m] of smooth impacts
+
+
+@dataclass(frozen=True)
+class Group:
+    """Records that are simulated together, and which they are."""
+
+    plan: Plan
+    data: Data
+    members: tuple[int, ...]
+
+
+# ---- records in arrays
+
+
+def make_groups(found: Sequence[Run], slots: Sequence[Slot], shared: int, dt: float | None) -> list[Group]:
+    """Records of one structure together.
+
+    Args:
+        shared: how many of the slots belong to all records.
+        dt: [s] longest step; default the median of the intervals between times.
+    """
+    gaps = np.concatenate([np.diff(_all_times(run)) for run in found])
+    if dt is not None and not dt > 0:
+        raise ValueError(f"dt is {dt}, expected > 0 [s]")
+    longest = float(np.median(gaps)) if dt is None else float(dt)
+    keys: dict[Any, list[int]] = {}
+    for index, run in enumerate(found):
+        scene = (run.world, run.state, run.channels)
+        shapes = tuple(jnp.shape(leaf) for leaf in jax.tree.leaves(scene))
+        keys.setdefault((jax.tree.structure(scene), shapes), []).append(index)
+    weights = tuple(1.0 if k >= shared else float(len(found)) ** -0.5 for k in range(len(slots)))
+    return [_group([found[i] for i in members], tuple(members), slots, weights, longest) for members in keys.values()]
+
+
+def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], priors, longest: float) -> Group:
+    dtype = found[0].state.x.dtype
+    scenes = [Scene(run.world, run.state, run.channels) for run in found]
+    here = tuple(slot if all(knows(scenes[0], p) for p in slot.paths) else _absent(slot) for slot in slots)
+    freed = {path for slot in here for path in slot.paths}
+    clocked = tuple(
+        name
+        for name in found[0].channels
+        if {f"{name}.clock", "clock"} & freed or any(float(run.channels[name].clock) != 0 for run in found)
+    )
+    grids = [_grid(run, longest) for run in found]
+    steps = max(len(lengths) for lengths, _ in grids)
+    lengths = [np.concatenate([a, np.full(steps - len(a), longest)]) for a, _ in grids]
+    names = list(found[0].channels)
+    rows = {name: max(len(_series(run, name).t) for run in found) for name in names}
+
+    def stacked(make):
+        return {name: _side_by_side([_padded(make(k, name), rows[name]) for k in range(len(found))]) for name in names}
+
+    data = Data(
+        scene=jax.tree.map(lambda *leaves: _side_by_side(leaves), *scenes),
+        lengths=_side_by_side(lengths),
+        rows=stacked(lambda k, name: grids[k][1][name]),
+        times={k: v for k, v in stacked(lambda k, n: _series(found[k], n).t - found[k].start).items() if k in clocked},
+        measured=stacked(lambda k, name: np.nan_to_num(_series(found[k], name).values)),
+        weights=stacked(lambda k, name: known(found[k], name).astype(float)),
+        width=np.zeros(()),
+    )
+    data = jax.tree.map(lambda a: jnp.asarray(a, dtype if np.issubdtype(a.dtype, np.floating) else np.int32), data)
+    return Group(Plan(here, clocked, priors), data, members)
+
+
+def _absent(slot: Slot) -> Slot:
+    """The place of a parameter in z, for scenes that do not have it."""
+    return Slot(slot.name, (), slot.kind, slot.size)
+
+
+def _all_times(run: Run) -> np.ndarray:
+    """Start and every measured time, once each."""
+    t = np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
+    return t[np.concatenate([[True], np.diff(t) > SAME])]
+
+
+def _grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Lengths of the steps that land on every measured time, and for each column the state of each of its rows."""
+    t = _all_times(run)
+    gaps = np.diff(t)
+    counts = np.maximum(np.ceil(gaps / longest - 1e-6), 1).astype(int)
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    index = {s.name: ends[np.clip(np.searchsorted(t, s.t - SAME), 0, len(t) - 1)] for s in run.series}
+    return np.repeat(gaps / counts, counts), index
+
+
+def _series(run: Run, name: str) -> Series:
+    return next(series for series in run.series if series.name == name)
+
+
+def known(run: Run, name: str) -> np.ndarray:
+    """Which residuals of a column are measured, (K, size of the residual) bool."""
+    finite = np.isfinite(_series(run, name).values)
+    observer = run.channels[name].observer
+    if not (isinstance(observer, Part) and observer.field == "q"):
+        return finite
+    return np.repeat(finite.all(1, keepdims=True), 1 if finite.shape[1] == 2 else 3, axis=1)
+
+
+def circular(run: Run, name: str) -> bool:
+    """True for columns of angles."""
+    observer = run.channels[name].observer
+    return isinstance(observer, Part) and observer.field == "angle"
+
+
+def _padded(array: np.ndarray, rows: int) -> np.ndarray:
+    return np.concatenate([array, np.zeros((rows - len(array), *array.shape[1:]), array.dtype)])
+
+
+def _side_by_side(leaves: Sequence[Any]) -> np.ndarray:
+    """Arrays along a new last axis, of length 1 if all are equal."""
+    leaves = [np.asarray(leaf) for leaf in leaves]
+    alike = all(leaf is leaves[0] or np.array_equal(leaf, leaves[0]) for leaf in leaves)
+    return np.stack(leaves[:1] if alike else leaves, axis=-1)
+
+
+# ---- residuals
+
+
+def residuals(plan: Plan, z: Array, data: Data) -> Array:
+    """Weighted residuals (m, B) of B lanes z (n, B); arrays of `data` have a last axis of 1 or B.
+
+    Rows of priors come last, shared among the records so that their squares sum to one prior.
+    """
+    lanes = z.shape[1]
+    scene = _lanes(plan.slots, data.scene, z)
+    world, _ = paths.write(scene.world, scene.state, "contact.width", data.width)
+    world, start = aligned(world, scene.state)
+    lengths = jnp.broadcast_to(data.lengths, (data.lengths.shape[0], lanes))
+    states = scan_steps(world, start, lengths, None, (1,) * lengths.shape[0])
+    rows = []
+    for name, channel in scene.channels.items():
+        if name in plan.clocked:
+            seen = states_at(world, states, lengths, data.times[name] - channel.clock[None])
+        else:
+            seen = jax.tree.map(lambda leaf, index=data.rows[name]: _pick(leaf, index), states)
+        away = difference(channel, seen, data.measured[name]) * data.weights[name]
+        rows.append(away.reshape(-1, lanes))
+    return jnp.concatenate([*rows, *_prior_rows(plan, data.scene, z)])
+
+
+def _lanes(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
+    """The scene of every lane."""
+    batched = jax.tree.map(lambda leaf: -1 if leaf.shape[-1] > 1 else None, scene)
+    scene = jax.tree.map(lambda leaf: leaf if leaf.shape[-1] > 1 else leaf[..., 0], scene)
+    return jax.vmap(lambda scene, z: put(slots, scene, z), in_axes=(batched, -1), out_axes=-1)(scene, z)
+
+
+def _pick(leaf: Array, index: Array) -> Array:
+    """Rows of states (S+1, ..., B) by index (K, 1) or (K, B)."""
+    if index.shape[1] == 1:
+        return leaf[index[:, 0]]
+    return jnp.take_along_axis(leaf, index.reshape(len(index), *[1] * (leaf.ndim - 2), -1), axis=0)
+
+
+def _prior_rows(plan: Plan, scene: Scene, z: Array) -> list[Array]:
+    rows = []
+    first = jax.tree.map(lambda leaf: leaf[..., 0], scene)
+    for slot, piece, share in zip(plan.slots, split(plan.slots, z), plan.priors, strict=True):
+        if slot.prior is not None:
+            value = jax.vmap(partial(slot.kind.value, reference=reference(slot, first)), -1, -1)(piece)
+            value = value.reshape(-1, z.shape[1])
+            mean, deviation = (jnp.asarray(p, z.dtype)[:, None] for p in (slot.prior.mean, slot.prior.deviation))
+            rows.append(share * (value - mean) / deviation)
+    return rows
+
+
+@partial(jax.jit, static_argnames="plan", compiler_options={"xla_cpu_use_fusion_emitters": False})
+def linearise(plan: Plan, z: Array, data: Data) -> tuple[Array, Array]:
+    """Residuals (m, R, S) and their Jacobian (m, n, R, S) at z (n, R, S), R records and S starts, by forward mode.
+
+    The n directions lie on the last axis too, each with the state beside it: it costs some more to run than to share
+    the state among them, and half as much to trace.
+    """
+    n, R, S = z.shape
+    wide = jnp.broadcast_to(z[:, None], (n, n, R, S)).reshape(n, -1)
+    unit = jnp.broadcast_to(jnp.eye(n, dtype=z.dtype)[:, :, None, None], (n, n, R, S)).reshape(n, -1)
+    spread_out = _spread(data, n, S)
+    value, slope = jax.jvp(lambda z: residuals(plan, z, spread_out), (wide,), (unit,))
+    return value.reshape(-1, n, R, S)[:, 0], slope.reshape(-1, n, R, S)
+
+
+def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
+    """Residuals (m, R, S) at z (n, R, S), without derivatives; differentiable in both modes."""
+    n, R, S = z.shape
+    return residuals(plan, z.reshape(n, -1), _spread(data, 1, S)).reshape(-1, R, S)
+
+
+evaluate = jax.jit(residuals_of, static_argnames="plan", compiler_options={"xla_cpu_use_fusion_emitters": False})
+
+
+def _spread(data: Data, copies: int, starts: int) -> Data:
+    """Arrays of R records for the lanes (copies, R, starts); those with one for all stay as they are."""
+
+    def spread(leaf: Array) -> Array:
+        if leaf.ndim == 0 or leaf.shape[-1] == 1:
+            return leaf
+        wide = jnp.broadcast_to(leaf[..., None, :, None], (*leaf.shape[:-1], copies, leaf.shape[-1], starts))
+        return wide.reshape(*leaf.shape[:-1], -1)
+
+    return jax.tree.map(spread, data)

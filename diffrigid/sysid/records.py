@@ -1,0 +1,244 @@
+"""Measured records: columns by name from a dictionary, a table or a CSV file, checked."""
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from diffrigid.state import State
+from diffrigid.sysid.sensors import Channel, Part, channel_of
+from diffrigid.world import World, check
+
+SAME = 1e-9  # [s] times of different columns that are this close are one
+UNLIKE = 20.0  # [-] speeds that differ by more than this factor from those of the positions are in another unit
+
+
+@dataclass(frozen=True)
+class Record:
+    """One measured run, where several are fitted together.
+
+    Args:
+        observations: as of `fit`.
+        state: its own initial state; default that of `fit`. world: likewise.
+        start: [s] time of the initial state; default the first time of its columns.
+        noise: standard deviations of its columns, numbers or arrays like the columns; default those of `fit`.
+    """
+
+    observations: Any
+    state: State | None = None
+    world: World | None = None
+    start: float | None = None
+    noise: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Series:
+    """One measured column."""
+
+    name: str
+    t: np.ndarray  # (K,) [s], increasing
+    values: np.ndarray  # (K, size), NaN where missing
+
+
+@dataclass(frozen=True)
+class Run:
+    """A record, read and checked, with its scene."""
+
+    world: World
+    state: State
+    channels: dict[str, Channel]
+    series: tuple[Series, ...]
+    start: float  # [s]
+    noise: Mapping[str, Any]
+
+
+def runs(world: World, state: State, observations: Any, observe: Mapping[str, Any], noise: Mapping | None) -> list[Run]:
+    """All records of a fit.
+
+    Args:
+        observations: of one record, or a list of such and of Records.
+
+    Raises:
+        ValueError: unknown names, wrong shapes, times that do not increase, a column without any number.
+    """
+    check(world, state)
+    several = isinstance(observations, list | tuple)
+    records = [r if isinstance(r, Record) else Record(r) for r in (observations if several else [observations])]
+    if not records:
+        raise ValueError("observations is an empty list: expected at least one record")
+    found = []
+    for index, record in enumerate(records):
+        where = f"observations[{index}]" if several else "observations"
+        own_world, own_state = record.world or world, record.state or state
+        check(own_world, own_state)
+        series, channels = columns(own_world, record.observations, observe, where)
+        names = [s.name for s in series]
+        if unknown := set(record.noise or {}) - set(names):
+            raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
+        given = {name: sigma for name, sigma in (noise or {}).items() if name in names} | dict(record.noise or {})
+        first = min(float(s.t[0]) for s in series)
+        start = first if record.start is None else float(record.start)
+        if start > first:
+            raise ValueError(
+                f"{where}: start is {start:g} s, after the first measured time {first:g} s: make it earlier"
+            )
+        found.append(Run(own_world, own_state, channels, series, start, given))
+    everywhere = sorted({s.name for run in found for s in run.series})
+    if unknown := set(noise or {}) - set(everywhere):
+        raise ValueError(f"noise: no column {sorted(unknown)[0]!r} in observations, there are {everywhere}")
+    _refuse_empty_columns(found)
+    return found
+
+
+def columns(
+    world: World, observations: Any, observe: Mapping[str, Any], where: str = "observations"
+) -> tuple[tuple[Series, ...], dict[str, Channel]]:
+    """Columns of a record, and what each observes.
+
+    Args:
+        observations: a mapping or a table (anything with `columns`), or the path of a CSV file. "t" (K,) [s], and by
+            name (K,) or (K, size), NaN where missing; or a pair (t, values) for a column with times of its own. A
+            component stands alone as "ball.x[0]".
+        observe: what a column observes if it is not named for that.
+    """
+    table = _table(observations, where)
+    shared = None if "t" not in table else _times(table.pop("t"), f'{where}["t"]')
+    gathered = _gather(table)
+    found, channels = [], {}
+    for name, values in gathered.items():
+        channel = channel_of(name, observe.get(name, name), world)
+        if isinstance(values, tuple) and len(values) == 2:
+            t, values = _times(values[0], f"{where}[{name!r}]"), values[1]
+        elif shared is not None:
+            t = shared
+        else:
+            raise ValueError(f'{where}: expected a column "t" of times [s], got {sorted(gathered)}')
+        values = _filled(values, len(t), channel.bias.shape[0], f"{where}[{name!r}]", world)
+        found.append(Series(name, t, values))
+        channels[name] = channel
+    if unused := set(observe) - set(gathered):
+        raise ValueError(f"observe: no column {sorted(unused)[0]!r} in {where}, there are {sorted(gathered)}")
+    if not found:
+        raise ValueError(f"{where}: nothing is measured, there is no column beside the times")
+    _refuse_units(found, channels, where)
+    return tuple(found), channels
+
+
+def read_csv(path: str | Path) -> dict[str, np.ndarray]:
+    """Columns of a file with one line of names; an empty cell is missing."""
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    names, body = [name.strip() for name in rows[0]], rows[1:]
+    for number, row in enumerate(body, start=2):
+        if len(row) != len(names):
+            raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)} like the names")
+    try:
+        cells = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in body])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; expected numbers under one line of names, empty where missing") from None
+    return {name: cells[:, k] for k, name in enumerate(names)} if len(body) else {name: np.zeros(0) for name in names}
+
+
+def _table(observations: Any, where: str) -> dict[str, Any]:
+    if isinstance(observations, str | Path):
+        return dict(read_csv(observations))
+    if hasattr(observations, "columns"):
+        return {str(name): np.asarray(observations[name]) for name in observations.columns}
+    if not isinstance(observations, Mapping):
+        raise ValueError(
+            f"{where} is a {type(observations).__name__}: expected a dict, a table or the path of a CSV file"
+        )
+    return dict(observations)
+
+
+def _times(t: Any, where: str) -> np.ndarray:
+    t = np.asarray(t, float)
+    if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all():
+        raise ValueError(f"{where}: expected at least two increasing times, without NaN")
+    return t
+
+
+def _gather(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Components "ball.x[0]", "ball.x[1]" put together under "ball.x", as {component: values}."""
+    out: dict[str, Any] = {}
+    for name, values in table.items():
+        if match := re.fullmatch(r"(.+)\[(\d+)\]", name):
+            parts = out.setdefault(match[1], {})
+            if not isinstance(parts, dict):
+                raise ValueError(f"observations: both {match[1]!r} and {name!r} are given: leave one out")
+            parts[int(match[2])] = values
+        elif name in out:
+            raise ValueError(f"observations: both {name!r} and a component of it are given: leave one out")
+        else:
+            out[name] = values
+    return out
+
+
+def _filled(values: Any, rows: int, size: int, where: str, world: World) -> np.ndarray:
+    """(K, size), from an array or from some of its components."""
+    if isinstance(values, dict):
+        if bad := [index for index in values if index >= size]:
+            raise ValueError(f"{where}: component [{bad[0]}] of {size} in this {world.dim}D world")
+        whole = np.full((rows, size), np.nan)
+        for index, part in values.items():
+            part = np.asarray(part, float)
+            if part.shape != (rows,):
+                raise ValueError(f"{where}[{index}] has shape {part.shape}, expected ({rows},) like t")
+            whole[:, index] = part
+        return whole
+    values = np.asarray(values, float)
+    values = values[:, None] if values.ndim == 1 else values
+    if values.shape != (rows, size):
+        raise ValueError(
+            f"{where} has shape {values.shape}, expected ({rows}, {size}) like t in this {world.dim}D world"
+        )
+    return values
+
+
+def _refuse_empty_columns(found: list[Run]) -> None:
+    known: dict[str, bool] = {}
+    for run in found:
+        for s in run.series:
+            known[s.name] = known.get(s.name, False) or bool(np.isfinite(s.values).any())
+    if empty := [name for name, any_number in known.items() if not any_number]:
+        raise ValueError(
+            f"observations[{empty[0]!r}]: nothing is measured, every value is NaN: leave the column out, or look where "
+            "the NaN were made"
+        )
+
+
+def _refuse_units(found: list[Series], channels: Mapping[str, Channel], where: str) -> None:
+    """Velocities that are far from the slopes of the positions of the same body were given in another unit."""
+    parts = {(c.observer.body, c.observer.field): name for name, c in channels.items() if isinstance(c.observer, Part)}
+    by_name = {s.name: s for s in found}
+    for (body, field), name in parts.items():
+        if field == "v" and (body, "x") in parts:
+            x, v = by_name[parts[body, "x"]], by_name[name]
+            steps, speeds = _median_size(np.diff(x.values, axis=0) / np.diff(x.t)[:, None]), _median_size(v.values)
+            if steps > 0 and speeds > 0 and not 1 / UNLIKE < speeds / steps < UNLIKE:
+                raise ValueError(
+                    f"{where}[{name!r}]: speeds of about {speeds:.3g}, but {parts[body, 'x']!r} moves at {steps:.3g} a "
+                    "second: are both in metres and seconds?"
+                )
+
+
+def _median_size(vectors: np.ndarray) -> float:
+    """Median length of the vectors (K, D) that are complete; 0 if none is."""
+    complete = vectors[np.isfinite(vectors).all(1)]
+    return float(np.median(np.sqrt((complete**2).sum(1)))) if len(complete) else 0.0
+
+
+def noise_guess(values: np.ndarray, circular: bool) -> float:
+    """Standard deviation of the noise of a column (K, size) from second differences, which smooth motion hardly has."""
+    first = np.diff(values, axis=0)
+    first = np.arctan2(np.sin(first), np.cos(first)) if circular else first
+    second = np.abs(np.diff(first, axis=0))
+    second = second[np.isfinite(second)]
+    if second.size == 0:
+        return 1.0
+    floor = 1e-9 + 1e-6 * float(np.nanmax(np.abs(values)))
+    return max(float(np.median(second)) / (0.6745 * np.sqrt(6.0)), floor)

@@ -1,0 +1,261 @@
+"""The result of a fit: numbers with intervals, what is known of them, and what can be asked of it."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid.paths import unit
+from diffrigid.state import State
+from diffrigid.step import Trajectory, rollout
+from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
+from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
+from diffrigid.sysid.free import Free
+from diffrigid.sysid.levenberg import best_by_record, levenberg
+from diffrigid.sysid.parameters import Scene, Slot, knows, reference
+from diffrigid.sysid.setup import Problem, by_column, make_problem, make_starts, reach_of, scene_of, with_noise
+from diffrigid.sysid.summary import Parameter, Summary
+from diffrigid.sysid.table import html_table, text_table
+from diffrigid.world import World
+
+SCORED = 30  # iterations for the numbers of a record that was held out
+CLOSE = 0.95  # [-] a correlation from which two parameters are reported to move together
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of `fit`."""
+
+    summary: Summary
+    problem: Problem
+    scenes: tuple[Scene, ...]  # of every record, with the parameters put in
+    shared: np.ndarray  # (a,) z of the shared numbers
+    own: np.ndarray  # (b, R) z of those of each record
+    linear: Linear
+    uncertainty: Uncertainty  # of the shared numbers z
+    residuals: tuple[dict[str, np.ndarray], ...]  # of each record by column, (K, size), in standard deviations
+    starts: np.ndarray  # (a, starts) z of the shared numbers where every start ended, as `order` has them
+    loss: Any
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.summary.parameters
+
+    @property
+    def noise(self) -> dict[str, float]:
+        return self.summary.noise
+
+    @property
+    def costs(self) -> np.ndarray:
+        return self.summary.costs
+
+    @property
+    def agree(self) -> int:
+        return self.summary.agree
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.summary.notes
+
+    @property
+    def world(self) -> World:
+        """Of the first record."""
+        return self.scenes[0].world
+
+    @property
+    def state(self) -> State:
+        """Initial state of the first record."""
+        return self.scenes[0].state
+
+    @property
+    def t(self) -> np.ndarray:
+        """(T+1,) [s] times of the first record, from its start on."""
+        run = self.problem.runs[0]
+        return np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the shared unbounded numbers z, (a, a)."""
+        return self.uncertainty.covariance
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Of the shared numbers, (a, a)."""
+        return correlations(self.uncertainty.covariance)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The fitted motion of the first record at its measured times."""
+        return self.predict()
+
+    def predict(self, times: Any = None, record: int = 0, dt: float | None = None) -> Trajectory:
+        """Fitted motion of a record from its start on.
+
+        Args:
+            times: [s] increasing, the first at or after the start of the record; default its measured times.
+            dt: [s] longest step; default the longest interval between the measured times.
+        """
+        scene, run = self.scenes[record], self.problem.runs[record]
+        measured = np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
+        wanted = measured if times is None else np.asarray(times, float)
+        later = wanted if wanted[0] <= run.start else np.concatenate([[run.start], wanted])
+        longest = float(np.diff(measured).max()) if dt is None else dt
+        motion = rollout(scene.world, scene.state, dt=longest, times=later)
+        extra = len(later) - len(wanted)
+        state = jax.tree.map(lambda leaf: leaf[extra:], motion.state) if extra else motion.state
+        return Trajectory(t=motion.t[extra:], state=state, world=motion.world)
+
+    def score(self, observations: Any, starts: int = 1, seed: int = 0) -> dict[str, float]:
+        """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
+
+        Numbers that every record has for itself are found anew, from several starts if asked for; without such, a
+        record starts from its own state, by default that of the first record of the fit.
+        """
+        shared = replace(self.summary, parameters=tuple(p for p in self.parameters if not p.records))
+        free, observe = self.problem.free, self.problem.observe
+        problem = make_problem(self.world, self.state, observations, free=free, observe=observe, resume=shared)
+        problem = with_noise(problem, {name: self.noise.get(name, s) for name, s in problem.noise.items()})
+        z, reach = make_starts(problem, starts, seed), reach_of(problem, range(problem.sizes[0]))
+        z = z._replace(shared=jnp.repeat(z.shared[:, :1], starts, axis=1))
+        iterations = SCORED if problem.own else 0
+        point, _ = levenberg(problem.groups, z, self.loss, iterations, reach, lambda count, costs: None)
+        best = best_by_record(problem.groups, point, self.loss)
+        found = [by_column(problem, point, start)[k] for k, start in enumerate(best)]
+        out = {}
+        for name, sigma in problem.noise.items():
+            values = np.concatenate([sigma * columns[name].ravel() for columns in found if name in columns])
+            out[name] = float(np.sqrt(np.nanmean(values**2)))
+        return out
+
+    def with_intervals(self, intervals: Intervals) -> "Fit":
+        """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
+        uncertainty = intervals(self.linear)
+        parameters, notes = describe(
+            self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.scenes
+        )
+        summary = replace(self.summary, parameters=parameters, notes=notes)
+        return replace(self, summary=summary, uncertainty=uncertainty)
+
+    def save(self, path: str | Path) -> Path:
+        """Write what is in the table, with versions and seed, as JSON."""
+        return self.summary.save(path)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self.summary[name]
+
+    def __repr__(self) -> str:
+        return text_table(self.summary)
+
+    def _repr_html_(self) -> str:
+        return html_table(self.summary)
+
+
+# ---- intervals and notes
+
+
+def describe(
+    problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
+    residuals: tuple[dict[str, np.ndarray], ...], scenes: tuple[Scene, ...],
+) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
+    """The parameters with intervals, and the notes under the table."""
+    places = coordinates((*problem.shared, *problem.own), _references(problem))
+    blind = blind_directions(linear, places)
+    quantile = student_quantile(uncertainty.freedom)
+    covariance = infinite_where_blind(uncertainty.covariance, blind, linear.shared)
+    parameters = [
+        _shared_parameter(problem, slot, z, block, quantile, blind)
+        for slot, z, block in _pieces(problem.shared, shared, covariance)
+    ]
+    if problem.own:
+        blocks = [own_covariance(linear, k, uncertainty.covariance) for k in range(len(problem.runs))]
+        parameters += _own_parameters(problem, own, blocks, quantile, blind)
+    notes = [b.words for b in blind]
+    notes += weak(covariance, places[: linear.shared])
+    notes += _together(uncertainty.covariance, places[: linear.shared], blind)
+    series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]
+    series = [r for r in series if np.isfinite(r).any()]
+    given = all(name in run.noise for run in problem.runs for name in run.channels)
+    lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
+    count = sum(map(len, linear.rows))
+    notes += doubts(series, max(1.0 - lost / count, 0.05) if given else None)
+    return tuple(parameters), tuple(notes)
+
+
+def _references(problem: Problem) -> list[np.ndarray]:
+    scenes = [scene_of(run) for run in problem.runs]
+    return [
+        np.asarray(reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths))))
+        for slot in (*problem.shared, *problem.own)
+    ]
+
+
+def _pieces(slots: tuple[Slot, ...], z: np.ndarray, covariance: np.ndarray):
+    first = 0
+    for slot in slots:
+        rows = slice(first, first + slot.size)
+        yield slot, z[rows], covariance[rows, rows]
+        first += slot.size
+
+
+def _shared_parameter(problem: Problem, slot: Slot, z, covariance, quantile: float, blind) -> Parameter:
+    scenes = (scene_of(run) for run in problem.runs)
+    about = reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths)))
+    value, low, high = interval_of(slot, z, covariance, about, quantile)
+    note = "at its bound" if slot.kind.at_bound(value) else ""
+    if any(slot.name in b.names for b in blind):
+        note = "not determined, see below"
+    return Parameter(slot.name, value, low, high, unit_of(slot), note)
+
+
+def _own_parameters(problem: Problem, own: np.ndarray, blocks: list[np.ndarray], quantile: float, blind):
+    records, first = len(problem.runs), 0
+    for slot in problem.own:
+        rows = slice(first, first + slot.size)
+        triples = [
+            interval_of(slot, own[rows, k], blocks[k][rows, rows], reference(slot, scene_of(run)), quantile)
+            for k, run in enumerate(problem.runs)
+        ]
+        value, low, high = (np.stack(parts) for parts in zip(*triples, strict=True))
+        note = "at its bound" if slot.kind.at_bound(value) else ""
+        if any(slot.name in b.names for b in blind):
+            note = "not determined, see below"
+        yield Parameter(slot.name, value, low, high, unit_of(slot), note, records)
+        first += slot.size
+
+
+def interval_of(slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, quantile: float):
+    """Value, low and high end: through the map of z where it acts number by number, else to first order."""
+    deviation = np.sqrt(np.diag(covariance))
+    if isinstance(slot.kind, Free):
+        ends = (z, z - quantile * deviation, z + quantile * deviation)
+        return tuple(np.asarray(slot.kind.value(end, about), float) for end in ends)
+    centre = jnp.asarray(z, jnp.result_type(about))
+    value = np.asarray(slot.kind.value(centre, about), float)
+    slope = np.asarray(jax.jacfwd(slot.kind.value)(centre, about), float)
+    if not np.isfinite(covariance).all():
+        half = np.full(value.shape, np.inf)
+    else:
+        half = quantile * np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", slope, covariance, slope), 0.0))
+    return value, value - half, value + half
+
+
+def unit_of(slot: Slot) -> str:
+    """SI unit; that of a column's bias or of what it observes is the user's."""
+    return "s" if slot.paths[0].split(".")[-1] == "clock" else unit(slot.paths[0])
+
+
+def _together(covariance: np.ndarray, places, blind) -> list[str]:
+    """Pairs of shared numbers whose errors go together, beyond those that are not determined at all."""
+    rho, out = correlations(covariance), []
+    bad = {name for b in blind for name in b.names}
+    for i, first in enumerate(places):
+        for j in range(i):
+            if abs(rho[i, j]) > CLOSE and first.path not in bad and places[j].path not in bad:
+                out.append(
+                    (abs(rho[i, j]), f"{places[j].name} and {first.name} go together (correlation {rho[i, j]:.3f})")
+                )
+    return [text for _, text in sorted(out, reverse=True)[:3]]

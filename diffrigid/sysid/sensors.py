@@ -1,0 +1,239 @@
+"""What a measured column observes: a function of the state, with what may be wrong with the instrument.
+
+An observer is a callable record `observer(state) -> (size, *batch)` for one time; its float leaves can be fitted by
+the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point". Every column has besides
+
+    COLUMN.bias     (size,)  what it reads too much, in its unit
+    COLUMN.scale    [-]      what it reads per unit
+    COLUMN.clock    [s]      how far its clock is ahead: a time t of it is the time t - clock of the simulation
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from diffrigid import so3
+from diffrigid.convert import nearest, numbers
+from diffrigid.numerics import norm
+from diffrigid.pytree import Leaf, array, array_fields, map_arrays, pytree, replace, static
+from diffrigid.state import State, material_point, rotations
+from diffrigid.world import World, axis_sizes
+
+FIELDS = ("x", "v", "w", "q", "angle")
+
+
+def _first(metadata: dict[str, Any] | None = None) -> Any:
+    """Field that may be given by its place."""
+    return dataclasses.field(kw_only=False, metadata=metadata)
+
+
+@pytree
+class Part:
+    """A field of a body's state: "ball.x", "ball.v", "ball.w", or "ball.angle" (2D) and "ball.q", up to full turns."""
+
+    body: Any = static()
+    field: str = static()
+
+    def __call__(self, state: State) -> Array:
+        if self.field == "angle":
+            return jnp.arctan2(state.q[self.body, 1:], state.q[self.body, :1])
+        return getattr(state, self.field)[self.body]
+
+
+@pytree
+class Marker:
+    """World position of a point fixed to a body, (D,) [m]."""
+
+    body: Any = _first({"static": True})
+    point: Leaf = array("D", default=0.0)  # (D, *batch) [m] body axes, from the centre of mass
+
+    def __call__(self, state: State) -> Array:
+        return material_point(state, self.body, self.point)
+
+
+@pytree
+class Separation:
+    """Distance between two observed points, (1,) [m]; each a Marker or the name of a body."""
+
+    a: Any = _first()
+    b: Any = _first()
+
+    def __call__(self, state: State) -> Array:
+        return norm(self.a(state) - self.b(state))[None]
+
+
+@pytree
+class Homography:
+    """Pixels of a point of the plane in a camera that looks at it: (u, v) = (h0, h1) / h2, h = matrix (x, y, 1)."""
+
+    of: Any = _first()
+    matrix: Leaf = array("H", "H")  # (3, 3, *batch)
+
+    def __call__(self, state: State) -> Array:
+        x = self.of(state)
+        h = self.matrix[:, 0] * x[:1] + self.matrix[:, 1] * x[1:] + self.matrix[:, 2]
+        return h[:2] / h[2:]
+
+
+@pytree
+class Pinhole:
+    """Pixels of a point of space: (u, v) = focal (X, Y) / Z + center, in camera axes x right, y down, z forward."""
+
+    of: Any = _first()
+    x: Leaf = array("D")  # (3, *batch) [m] of the camera
+    q: Leaf = array("Q")  # (4, *batch) camera axes to world
+    focal: Leaf = array()  # (*batch) [pixel]
+    center: Leaf = array("P", default=(0.0, 0.0))  # (2, *batch) [pixel]
+
+    def __call__(self, state: State) -> Array:
+        seen = so3.unrotate(self.q, self.of(state) - self.x)
+        return self.focal[None] * seen[:2] / seen[2:] + self.center
+
+
+@pytree
+class Function:
+    """Any function of the state (N, D, *batch), for one time, that returns a number or a vector."""
+
+    fn: Callable = static()
+
+    def __call__(self, state: State) -> Array:
+        value = self.fn(state)
+        return value if value.ndim > state.x.ndim - 2 else value[None]
+
+
+@pytree
+class Channel:
+    """One column: what it observes, and its instrument."""
+
+    observer: Any = _first()
+    bias: Leaf = array("M", default=0.0)  # (size, *batch) in the unit of the column
+    scale: Leaf = array(default=1.0)  # (*batch) [-]
+    clock: Leaf = array(default=0.0)  # (*batch) [s]
+
+
+def predict(channel: Channel, states: State) -> Array:
+    """What the instrument reads at K times, (K, size, *batch), from states with a leading axis of times."""
+    return channel.scale[None, None] * jax.vmap(channel.observer)(states) + channel.bias[None]
+
+
+def difference(channel: Channel, states: State, measured: Array) -> Array:
+    """Predicted minus measured, (K, size of the residual, *batch); angles and turns in rad, at most half a turn."""
+    field = channel.observer.field if isinstance(channel.observer, Part) else ""
+    if field == "q":
+        so = rotations(states.x.shape[2])
+        q = states.q[:, channel.observer.body]
+        back = jnp.concatenate([measured[:, :1], -measured[:, 1:]], axis=1) + jnp.zeros_like(q)
+        return jax.vmap(lambda back, q: so.log(so.compose(back, q)))(back, q)
+    away = predict(channel, states) - measured
+    return jnp.arctan2(jnp.sin(away), jnp.cos(away)) if field == "angle" else away
+
+
+def channel_of(name: str, what: Any, world: World) -> Channel:
+    """The channel of a column from what a user says that it observes.
+
+    Args:
+        what: "ball.x", an observer, a Channel around one of them, or a function of the state.
+    """
+    channel = what if isinstance(what, Channel) else Channel(observer=what)
+    sizes = {"D": world.dim, "Q": 2 if world.dim == 2 else 4, "H": 3, "P": 2}
+    observer = map_arrays(partial(_fill, sizes), _resolved(name, channel.observer, world), name)
+    sizes["M"] = size_of(observer, world)
+    return map_arrays(partial(_fill, sizes), replace(channel, observer=observer), name)
+
+
+def _fill(sizes: dict[str, int], leaf: Any, letters: tuple[str, ...], path: str) -> Any:
+    """A leaf as an array with its axes; a number stands for all components."""
+    axes = tuple(sizes[letter] for letter in letters)
+    value = np.asarray(numbers(path, leaf, None))
+    return numbers(path, np.broadcast_to(value, axes) if value.ndim == 0 else value, axes)
+
+
+def size_of(observer: Any, world: World) -> int:
+    """Numbers that an observer gives for one time."""
+    sizes, count = axis_sizes(world), len(world.names)
+    shapes = {name: (count, sizes[letter]) for name, letter in zip("xqvw", "DQDA", strict=True)}
+    dtype = jnp.result_type(world.bodies.mass)
+    leaves: dict[str, Any] = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
+    value = jax.eval_shape(observer, State(**leaves))
+    if value.ndim != 1:
+        raise ValueError(f"an observer returned the shape {value.shape}, expected a number or a vector for one state")
+    return value.shape[0]
+
+
+def _resolved(name: str, what: Any, world: World) -> Any:
+    """An observer with indices for the names of bodies."""
+    if isinstance(what, str):
+        body, _, field = what.rpartition(".") if "." in what else (what, "", "x")
+        possible = [f"{b}.{f}" for b in world.names for f in FIELDS if f != "angle" or world.dim == 2]
+        if f"{body}.{field}" not in possible:
+            raise ValueError(
+                f"observations: no column {name!r} in this {world.dim}D world"
+                + ("" if name == what else f", which observes {what!r}")
+                + f": {nearest(what, possible)} Say what other columns observe by observe={{{name!r}: ...}}."
+            )
+        return Part(body=world.names.index(body), field=field)
+    if not hasattr(what, "__dataclass_fields__"):
+        if not callable(what):
+            raise ValueError(f"observe[{name!r}] is {what!r}: expected 'ball.x', Marker(body='ball'), or a function")
+        return Function(fn=what)
+    changes: dict[str, Any] = {}
+    target = getattr(what, "body", None)
+    if isinstance(target, str):
+        if target not in world.names:
+            hint = nearest(target, world.names)
+            raise ValueError(f"observe[{name!r}].body is {target!r}, which is not a moving body: {hint}")
+        changes["body"] = world.names.index(target)
+    changes |= {k: _resolved(name, getattr(what, k), world) for k in ("of", "a", "b") if hasattr(what, k)}
+    return replace(what, **changes)
+
+
+# ---- paths of columns
+
+
+def read_channel(channels: dict[str, Channel], path: str) -> Array:
+    """Value of COLUMN.field, or of "clock", which all columns share."""
+    node: Any = channels
+    for key in _chain(channels, path)[0]:
+        node = node[key] if isinstance(node, dict) else getattr(node, key)
+    return jnp.asarray(node)
+
+
+def write_channel(channels: dict[str, Channel], path: str, value: Array) -> dict[str, Channel]:
+    """The channels with one number or vector changed."""
+    for chain in _chain(channels, path):
+        channels = _updated(channels, chain, value)
+    return channels
+
+
+def channel_paths(channels: dict[str, Channel]) -> dict[str, list[tuple[str, ...]]]:
+    """Every path of the columns, and the attributes that it stands for."""
+    out: dict[str, list[tuple[str, ...]]] = {"clock": [(name, "clock") for name in channels]}
+    for name, channel in channels.items():
+        out |= {f"{name}.{field}": [(name, field)] for field in ("bias", "scale", "clock")}
+        out |= {f"{name}.{'.'.join(chain)}": [(name, "observer", *chain)] for chain in _leaves(channel.observer)}
+    return out
+
+
+def _leaves(observer: Any) -> list[tuple[str, ...]]:
+    chains: list[tuple[str, ...]] = [(field,) for field in array_fields(observer)]
+    for key in ("of", "a", "b"):
+        if hasattr(observer, key):
+            chains += [(key, *chain) for chain in _leaves(getattr(observer, key))]
+    return chains
+
+
+def _chain(channels: dict[str, Channel], path: str) -> list[tuple[str, ...]]:
+    return channel_paths(channels)[path]
+
+
+def _updated(node: Any, chain: tuple[str, ...], value: Array) -> Any:
+    key, rest = chain[0], chain[1:]
+    child = node[key] if isinstance(node, dict) else getattr(node, key)
+    child = _updated(child, rest, value) if rest else jnp.reshape(value, jnp.shape(child))
+    return {**node, key: child} if isinstance(node, dict) else replace(node, **{key: child})

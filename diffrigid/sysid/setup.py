@@ -1,0 +1,294 @@
+"""The problem that a fit solves, as data and plain functions for any other optimiser:
+
+problem = make_problem(world, state, observations, free={"restitution": interval(0, 1)}, noise={"ball.x": 1e-3})
+residuals, jacobian = partial(residual_vector, problem), partial(jacobian_matrix, problem)
+scipy.optimize.least_squares(residuals, start_vector(problem), jacobian)
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid.state import State
+from diffrigid.step import floats
+from diffrigid.sysid.covariance import Linear
+from diffrigid.sysid.free import Free
+from diffrigid.sysid.levenberg import Numbers, Point
+from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
+from diffrigid.sysid.problem import Group, circular, evaluate, known, linearise, make_groups
+from diffrigid.sysid.records import Run, noise_guess, runs
+from diffrigid.world import World
+
+LEAST = 1e-9  # noise that is taken for none
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is free, and all records in arrays."""
+
+    runs: tuple[Run, ...]
+    shared: tuple[Slot, ...]
+    own: tuple[Slot, ...]
+    groups: tuple[Group, ...]
+    noise: dict[str, float]  # of columns whose noise is not given with their record
+    free: Mapping[Any, Any]  # as the user gave it
+    observe: Mapping[str, Any]  # likewise
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Shared numbers a, and numbers b of each record."""
+        return sum(slot.size for slot in self.shared), sum(slot.size for slot in self.own)
+
+
+def make_problem(
+    world: World,
+    state: State,
+    observations: Any,
+    *,
+    free: Mapping[Any, Any],
+    observe: Mapping[str, Any] | None = None,
+    noise: Mapping[str, Any] | None = None,
+    dt: float | None = None,
+    resume: Any = None,
+) -> Problem:
+    """Checks all, and puts it into arrays. Arguments as of `fit`."""
+    found = runs(world, state, observations, observe or {}, noise)
+    pairs = [floats(run.world, run.state) for run in found]
+    found = [replace(run, world=w, state=s) for run, (w, s) in zip(found, pairs, strict=True)]
+    if resume is not None:
+        found = _resumed(found, resume, free)
+    shared, own = make_slots(free, [scene_of(run) for run in found])
+    groups = make_groups(found, (*shared, *own), len(shared), dt)
+    problem = Problem(tuple(found), shared, own, tuple(groups), {}, dict(free), dict(observe or {}))
+    return with_noise(problem, _noise_guesses(found))
+
+
+def scene_of(run: Run) -> Scene:
+    """The scene of a record."""
+    return Scene(run.world, run.state, run.channels)
+
+
+def with_noise(problem: Problem, noise: Mapping[str, float], window: float = np.inf, width: float = 0.0) -> Problem:
+    """The problem with weights for this noise, for the first `window` [s] of each record, and impacts this smooth."""
+    groups = []
+    for group in problem.groups:
+        weights = {}
+        for name, old in group.data.weights.items():
+            rows = [_weights(problem.runs[k], name, noise, window, old.shape[0]) for k in group.members]
+            weights[name] = jnp.asarray(np.stack(rows, axis=-1), old.dtype)
+        data = group.data._replace(weights=weights, width=jnp.asarray(width, group.data.width.dtype))
+        groups.append(replace(group, data=data))
+    return replace(problem, groups=tuple(groups), noise=dict(noise))
+
+
+def _weights(run: Run, name: str, noise: Mapping[str, float], window: float, rows: int) -> np.ndarray:
+    """1 / standard deviation, (rows, size), 0 where missing, beyond the window, or padded."""
+    here = known(run, name)
+    series = next(s for s in run.series if s.name == name)
+    sigma = np.asarray(run.noise.get(name, noise.get(name, 1.0)), float)
+    sigma = sigma[:, None] if sigma.ndim == 1 and len(sigma) == len(here) else sigma
+    try:
+        sigma = np.broadcast_to(sigma, here.shape)
+    except ValueError:
+        raise ValueError(
+            f"noise[{name!r}] has shape {sigma.shape}, expected a number or {here.shape} like the column"
+        ) from None
+    if not (sigma[here] > 0).all():
+        raise ValueError(f"noise[{name!r}]: expected standard deviations above 0; NaN in the column is for missing")
+    use = here & (series.t <= run.start + window)[:, None]
+    out = np.zeros((rows, here.shape[1]))
+    out[: len(here)] = np.where(use, 1.0 / np.where(here, sigma, 1.0), 0.0)
+    return out
+
+
+def _noise_guesses(found: Sequence[Run]) -> dict[str, float]:
+    """Median over the records of the guess for each column whose noise is not given."""
+    guesses: dict[str, list[float]] = {}
+    for run in found:
+        for series in run.series:
+            if series.name not in run.noise and np.isfinite(series.values).any():
+                guesses.setdefault(series.name, []).append(noise_guess(series.values, circular(run, series.name)))
+    return {name: float(np.median(values)) for name, values in guesses.items()}
+
+
+def _resumed(found: list[Run], saved: Any, free: Mapping[Any, Any]) -> list[Run]:
+    """Records whose scenes hold the values of an earlier fit, for parameters that are free again."""
+    slots = [slot for group in make_slots(free, [scene_of(run) for run in found]) for slot in group]
+    parameters = {p.name: p for p in saved.parameters}
+    out = []
+    for index, run in enumerate(found):
+        scene = scene_of(run)
+        for slot in slots:
+            if slot.name in parameters:
+                p = parameters[slot.name]
+                value = p.value[index] if p.records else p.value
+                for k, path in enumerate(slot.paths):
+                    scene = write(scene, path, jnp.asarray(value[k] if slot.joint else value, scene.state.x.dtype))
+        out.append(replace(run, world=scene.world, state=scene.state, channels=scene.channels))
+    return out
+
+
+# ---- z
+
+
+def first_numbers(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """z of the values in the scenes: (a,), (b, R)."""
+    shared = [slot.kind.unbounded(np.asarray(_value(problem, slot))) for slot in problem.shared]
+    own = [
+        [slot.kind.unbounded(np.asarray(reference(slot, scene_of(run)))) for run in problem.runs]
+        for slot in problem.own
+    ]
+    return _joined(shared), np.concatenate([np.stack(rows, 1) for rows in own]) if own else np.zeros(
+        (0, len(problem.runs))
+    )
+
+
+def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
+    """z of the values in the scenes, and of `count` - 1 random starts."""
+    random, (first, first_own) = np.random.default_rng(seed), first_numbers(problem)
+    shared, own = [first], [first_own]
+    for _ in range(count - 1):
+        shared.append(_joined([slot.kind.draw(np.asarray(_value(problem, slot)), random) for slot in problem.shared]))
+        rows = [
+            np.stack([slot.kind.draw(np.asarray(reference(slot, scene_of(run))), random) for run in problem.runs], 1)
+            for slot in problem.own
+        ]
+        own.append(np.concatenate(rows) if rows else first_own)
+    dtype = problem.runs[0].state.x.dtype
+    return Numbers(jnp.asarray(np.stack(shared, -1), dtype), jnp.asarray(np.stack(own, -1), dtype))
+
+
+def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
+    """The longest step of each number: a factor e^2 for one that z is the logarithm of, or the like; 0 if held."""
+    dtype = problem.runs[0].state.x.dtype
+    parts = []
+    for slots in (problem.shared, problem.own):
+        real = [isinstance(slot.kind, Free) and np.isinf(slot.kind.low) for slot in slots]
+        parts.append(_joined([np.full(slot.size, np.inf if r else 2.0) for slot, r in zip(slots, real, strict=True)]))
+    parts[0][list(held)] = 0.0
+    return Numbers(jnp.asarray(parts[0], dtype)[:, None], jnp.asarray(parts[1], dtype)[:, None, None])
+
+
+def _value(problem: Problem, slot: Slot) -> Any:
+    """Reference of a shared parameter: that of the first record that has it."""
+    scenes = (scene_of(run) for run in problem.runs)
+    return reference(slot, next(scene for scene in scenes if all(knows(scene, path) for path in slot.paths)))
+
+
+def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *parts])
+
+
+# ---- plain functions of one vector
+
+
+def start_vector(problem: Problem) -> np.ndarray:
+    """z of the values in the scenes: the shared numbers, then those of each record, (a + R b,)."""
+    shared, own = first_numbers(problem)
+    return np.concatenate([shared, own.T.ravel()])
+
+
+def unpack(problem: Problem, z: np.ndarray) -> Numbers:
+    """A vector (a + R b,) as one start."""
+    a, b = problem.sizes
+    dtype = problem.runs[0].state.x.dtype
+    own = np.asarray(z[a:]).reshape(len(problem.runs), b).T
+    return Numbers(jnp.asarray(z[:a], dtype)[:, None], jnp.asarray(own, dtype)[:, :, None])
+
+
+def residual_vector(problem: Problem, z: np.ndarray) -> np.ndarray:
+    """Residuals in standard deviations, (m,); 0 where a value is missing."""
+    numbers = unpack(problem, z)
+    parts = [evaluate(g.plan, numbers.of(g.members), g.data)[..., 0].T.ravel() for g in problem.groups]
+    return np.concatenate([np.asarray(part, float) for part in parts])
+
+
+def jacobian_matrix(problem: Problem, z: np.ndarray) -> np.ndarray:
+    """Derivatives of `residual_vector`, (m, a + R b)."""
+    numbers, (a, b) = unpack(problem, z), problem.sizes
+    blocks = []
+    for group in problem.groups:
+        slopes = np.asarray(linearise(group.plan, numbers.of(group.members), group.data)[1], float)[..., 0]
+        for k, member in enumerate(group.members):
+            block = np.zeros((len(slopes), len(z)))
+            block[:, :a] = slopes[:, :a, k]
+            block[:, a + member * b : a + (member + 1) * b] = slopes[:, a:, k]
+            blocks.append(block)
+    return np.concatenate(blocks)
+
+
+def fitted_scenes(problem: Problem, shared: np.ndarray, own: np.ndarray) -> list[Scene]:
+    """The scene of every record with the parameters z (a,), (b, R) put in."""
+    out: list[Any] = [None] * len(problem.runs)
+    for group in problem.groups:
+        for k in group.members:
+            z = jnp.asarray(np.concatenate([shared, own[:, k]]), problem.runs[k].state.x.dtype)
+            out[k] = _put(group.plan.slots, scene_of(problem.runs[k]), z)
+    return out
+
+
+_put = jax.jit(put, static_argnames="slots")
+
+
+# ---- a point as arrays of NumPy
+
+
+def linear_of(problem: Problem, point: Point, best: int, loss: Any, estimated: bool) -> Linear:
+    """Residuals and slopes of one start, record by record, without the rows that are missing."""
+    rows: list[Any] = [None] * len(problem.runs)
+    for group, r, jac in zip(problem.groups, point.residuals, point.jacobians, strict=True):
+        values, slopes = np.asarray(r, float)[..., best], np.asarray(jac, float)[..., best]
+        for k, member in enumerate(group.members):
+            use, t = row_mask(problem, group, k, len(values))
+            rows[member] = (values[use, k], slopes[use][..., k], t[use])
+    residuals, jacobians, times = zip(*rows, strict=True)
+    residuals, variance = _as_least_squares(loss, residuals, problem.sizes[0] + problem.sizes[1] * len(rows))
+    return Linear(residuals, jacobians, times, problem.sizes[0], variance, estimated)
+
+
+def _as_least_squares(loss: Any, residuals: tuple[np.ndarray, ...], numbers: int) -> tuple[Any, float]:
+    """Residuals that least squares would follow as the loss follows these, and their variance."""
+    if isinstance(loss, Squares):
+        return residuals, 1.0
+    joined = jnp.asarray(np.concatenate(residuals))
+    slope = jax.grad(lambda r: loss.rho(r).sum())
+    bend = float(jax.jvp(slope, (joined,), (jnp.ones_like(joined),))[1].mean())
+    parts = tuple(np.asarray(slope(jnp.asarray(r)), float) / max(bend, 0.05) for r in residuals)
+    variance = float(sum((part**2).sum() for part in parts) / max(len(joined) - numbers, 1))
+    return parts, variance
+
+
+def row_mask(problem: Problem, group: Group, k: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows of record k of a group are measured (or of a prior), and their times (m,)."""
+    use, times = [], []
+    for name, weights in group.data.weights.items():
+        w = np.asarray(weights)[..., k if weights.shape[-1] > 1 else 0]
+        t = np.zeros(len(w))
+        series = next(s for s in problem.runs[group.members[k]].series if s.name == name)
+        t[: len(series.t)] = series.t
+        use.append((w > 0).ravel())
+        times.append(np.repeat(t, w.shape[1]))
+    used, t = np.concatenate(use), np.concatenate(times)
+    priors = rows - len(used)
+    return np.concatenate([used, np.ones(priors, bool)]), np.concatenate([t, np.full(priors, np.nan)])
+
+
+def by_column(problem: Problem, point: Point, best: int) -> list[dict[str, np.ndarray]]:
+    """Residuals in standard deviations of every record, by column, (K, size), NaN where missing."""
+    out: list[Any] = [None] * len(problem.runs)
+    for group, r in zip(problem.groups, point.residuals, strict=True):
+        values = np.asarray(r, float)[..., best]
+        for k, member in enumerate(group.members):
+            first, found = 0, {}
+            for name, weights in group.data.weights.items():
+                w = np.asarray(weights)[..., k if weights.shape[-1] > 1 else 0]
+                piece = values[first : first + w.size, k].reshape(w.shape)
+                found[name] = np.where(w > 0, piece, np.nan)
+                first += w.size
+            out[member] = found
+    return out

@@ -1,0 +1,82 @@
+"""What is kept of a fit: its table, as text, HTML or JSON."""
+
+import json
+import platform
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid.sysid.table import html_table, text_table
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One fitted number, or vector; with `records` > 0 that of each record, along a first axis."""
+
+    name: str
+    value: np.ndarray
+    low: np.ndarray  # 95 % interval
+    high: np.ndarray
+    unit: str
+    note: str  # "" or why not to trust it
+    records: int = 0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What can be written to a file of a fit."""
+
+    parameters: tuple[Parameter, ...]
+    noise: dict[str, float]  # standard deviation of each column's residuals, in its unit
+    costs: np.ndarray  # (starts,) the loss of the residuals, lowest first; inf: diverged
+    agree: int  # starts that ended at the best cost
+    notes: tuple[str, ...]  # what the data cannot tell, and why not to believe the intervals
+    seed: int
+    seconds: float
+    versions: dict[str, str]
+
+    def __getitem__(self, name: str) -> Parameter:
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise KeyError(f"no parameter {name!r}; there are {[p.name for p in self.parameters]}")
+
+    def __repr__(self) -> str:
+        return text_table(self)
+
+    def _repr_html_(self) -> str:
+        return html_table(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Write a JSON file, which `load_fit` reads."""
+        data = asdict(self)
+        for parameter in data["parameters"]:
+            parameter |= {key: parameter[key].tolist() for key in ("value", "low", "high")}
+        data["costs"] = self.costs.tolist()
+        Path(path).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        return Path(path)
+
+
+def load_fit(path: str | Path) -> Summary:
+    """What `save` wrote: the table, and with `fit(..., resume=...)` where to go on from."""
+    data = json.loads(Path(path).read_text(encoding="utf-8"))
+    try:
+        parameters = tuple(
+            Parameter(**{**p, **{key: np.asarray(p[key], float) for key in ("value", "low", "high")}})
+            for p in data.pop("parameters")
+        )
+        return Summary(
+            parameters=parameters, costs=np.asarray(data.pop("costs"), float), notes=tuple(data.pop("notes")), **data
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a saved fit: {error}") from error
+
+
+def versions() -> dict[str, str]:
+    """Of what a result depends on."""
+    names = {"diffrigid": version("diffrigid"), "jax": jax.__version__, "numpy": np.__version__}
+    return names | {"python": platform.python_version(), "dtype": str(jnp.result_type(float))}

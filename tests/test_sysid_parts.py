@@ -1,0 +1,342 @@
+"""The parts of a fit that have exact answers on their own: kinds, sensors, records, losses, tests of residuals, files."""
+
+import contextlib
+import io
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+from diffrigid import sysid
+from diffrigid.__main__ import main
+from diffrigid.scene_file import read_scene
+from diffrigid.sysid.diagnosis import doubts, normality, whiteness
+from diffrigid.sysid.records import columns, read_csv
+from diffrigid.sysid.sensors import channel_of, difference, predict
+
+WORLD, STATE = dr.scene(
+    {
+        "cue": dr.Body(None, mass=1.0, inertia=1.0, x=(1.0, 2.0), angle=0.5, v=(3.0, 0.0)),
+        "ball": dr.Body(None, mass=2.0, inertia=1.0, x=(4.0, 6.0)),
+    }
+)
+SOLID, SOLID_STATE = dr.scene({"die": dr.Body(None, mass=1.0, inertia=(1.0, 1.0, 1.0), x=(0.2, -0.4, 5.0))})
+T = np.arange(6) / 10
+
+
+# ---- kinds of parameters
+
+
+@pytest.mark.parametrize("shape, kind", [((2,), dr.direction()), ((3,), dr.direction())])
+def test_directions_keep_their_length(shape, kind):
+    reference = jnp.arange(1.0, 1 + shape[0])
+    value = kind.value(0.7 * jnp.ones(kind.size(shape)), reference)
+    assert_allclose((value**2).sum(), (reference**2).sum(), rtol=1e-12)
+    assert_allclose(kind.value(jnp.zeros(kind.size(shape)), reference), reference, atol=1e-14)
+    turn = np.arccos(value @ reference / (reference @ reference))
+    assert_allclose(turn, 0.7 * np.sqrt(kind.size(shape)), rtol=1e-9)  # z is the angle
+
+
+def test_every_inertia_is_one_of_some_masses():
+    random, kind = np.random.default_rng(0), dr.inertia()
+    reference = jnp.diag(jnp.array([0.2, 0.3, 0.25]))
+    assert_allclose(kind.value(jnp.zeros(6), reference), reference, atol=1e-15)
+    for _ in range(20):
+        principal = np.linalg.eigvalsh(kind.value(jnp.asarray(2 * random.normal(size=6)), reference))
+        assert principal[0] > 0 and principal[2] < principal[0] + principal[1]
+    slopes = jax.jacfwd(kind.value)(jnp.zeros(6), reference)[np.triu_indices(3)]
+    assert np.linalg.matrix_rank(slopes) == 6  # every symmetric change is reached
+    with pytest.raises(ValueError, match=r"expected \(3, 3\)"):
+        kind.size(())
+
+
+def test_shares_keep_their_sum_and_take_any_ratio():
+    kind, reference = dr.shares(), jnp.array([1.0, 3.0, 4.0])
+    value = kind.value(jnp.array([0.4, -1.0]), reference)
+    assert_allclose(value.sum(), 8.0, rtol=1e-12)
+    assert_allclose(np.log(value[1:] / value[0]), np.log([3.0, 4.0]) + [0.4, -1.0], rtol=1e-12)
+
+
+def test_rotation_is_a_turn_of_the_start():
+    kind, q = dr.rotation(), jnp.array([0.6, 0.8, 0.0, 0.0])
+    value = kind.value(jnp.array([0.0, 0.0, 0.3]), q)
+    assert_allclose(value, dr.so3.compose(dr.so3.exp(jnp.array([0.0, 0.0, 0.3])), q), atol=1e-14)
+
+
+def test_a_start_at_zero_of_a_positive_parameter_is_moved_off():
+    assert_allclose(np.exp(dr.positive().unbounded(np.array([0.0, 0.2]))), [1e-3, 0.2])
+
+
+# ---- sensors
+
+
+def reading(what, world=WORLD, state=STATE):
+    channel = jax.tree.map(jnp.asarray, channel_of("c", what, world))
+    return np.asarray(predict(channel, jax.tree.map(lambda leaf: leaf[None], state)))[0]
+
+
+def test_observers_read_what_geometry_says():
+    c, s = np.cos(0.5), np.sin(0.5)
+    point = (1.0 + 0.3 * c - 0.1 * s, 2.0 + 0.3 * s + 0.1 * c)
+    assert_allclose(reading("cue.x"), (1.0, 2.0))
+    assert_allclose(reading("cue.angle"), (0.5,))
+    assert_allclose(reading(dr.Marker("cue", point=(0.3, 0.1))), point)
+    assert_allclose(reading(dr.Separation("cue", dr.Marker("ball"))), (5.0,))
+    assert_allclose(reading(lambda state: state.x[1] - state.x[0]), (3.0, 4.0))
+    assert_allclose(reading(lambda state: state.v[0, 0]), (3.0,))
+    assert_allclose(reading(dr.Channel("cue.x", bias=(0.1, 0.0), scale=2.0)), (2.1, 4.0))
+
+
+def test_cameras():
+    matrix = np.array([[200.0, 10.0, 5.0], [0.0, -150.0, 400.0], [0.1, 0.0, 1.0]])
+    u = matrix @ (1.0, 2.0, 1.0)
+    assert_allclose(reading(dr.Homography("cue", matrix=matrix)), u[:2] / u[2])
+    camera = dr.Pinhole("die", x=(0.0, 0.0, 1.0), q=(1.0, 0.0, 0.0, 0.0), focal=800.0, center=(320.0, 240.0))
+    assert_allclose(reading(camera, SOLID, SOLID_STATE), (320 + 800 * 0.2 / 4, 240 - 800 * 0.4 / 4))
+
+
+def test_angles_are_compared_up_to_full_turns():
+    states = jax.tree.map(lambda leaf: leaf[None], STATE)
+    channel = jax.tree.map(jnp.asarray, channel_of("cue.angle", "cue.angle", WORLD))
+    assert_allclose(difference(channel, states, jnp.array([[0.4 + 6 * np.pi]])), [[0.1]], atol=1e-12)
+    channel = jax.tree.map(jnp.asarray, channel_of("cue.q", "cue.q", WORLD))
+    measured = jnp.array([[np.cos(0.4), np.sin(0.4)]])
+    assert_allclose(difference(channel, states, measured), [[0.1]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("cue.z", "did you mean"),
+        (dr.Marker("coe"), "did you mean 'cue'"),
+        (3.0, "expected 'ball.x', Marker"),
+        (dr.Marker("cue", point=(1.0, 2.0, 3.0)), "shape"),
+        (lambda state: state.x, "expected a number or a vector"),
+    ],
+)
+def test_bad_observers(what, message):
+    with pytest.raises(ValueError, match=message):
+        channel_of("c", what, WORLD)
+
+
+# ---- records
+
+
+class Table:
+    """What pandas looks like from here."""
+
+    columns = ("t", "cue.x[1]", "cue.angle")
+
+    def __getitem__(self, name):
+        return {"t": T, "cue.x[1]": T**2, "cue.angle": 0 * T}[name]
+
+
+def test_tables_files_and_dictionaries_say_the_same(tmp_path):
+    file = tmp_path / "data.csv"
+    rows = [f"{t},{t**2},{'' if k == 2 else 0.0}" for k, t in enumerate(T)]
+    file.write_text("\n".join(["t,cue.x[1],cue.angle", *rows]) + "\n")
+    for data in (Table(), file, read_csv(str(file))):
+        series, _ = columns(WORLD, data, {})
+        x, angle = series
+        assert (x.name, angle.name) == ("cue.x", "cue.angle")
+        assert np.isnan(x.values[:, 0]).all()
+        assert_allclose(x.values[:, 1], T**2)
+        assert np.isnan(angle.values[2]).all() == (not isinstance(data, Table))
+
+
+def test_columns_may_have_times_of_their_own():
+    slow = T[::2] + 0.03
+    series, _ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
+    assert_allclose([s.t[-1] for s in series], [T[-1], slow[-1]])
+
+
+GOOD = {"t": T, "cue.x": np.zeros((6, 2))}
+
+
+@pytest.mark.parametrize(
+    ("data", "arguments", "message"),
+    [
+        ({"cue.x": np.zeros((6, 2))}, {}, 'expected a column "t"'),
+        (GOOD | {"t": T[::-1]}, {}, "increasing times"),
+        (GOOD | {"cue.x": np.zeros((6, 3))}, {}, r"expected \(6, 2\) like t in this 2D world"),
+        (GOOD | {"cue.x[0]": T}, {}, "leave one out"),
+        ({"t": T, "cue.x[2]": T}, {}, r"component \[2\] of 2"),
+        (GOOD | {"cu.x": T}, {}, "did you mean 'cue.x'"),
+        (GOOD | {"ball.x": np.full((6, 2), np.nan)}, {}, "every value is NaN"),
+        ({"t": T, "cue.x": np.outer(T, (3.0, 0.0)), "cue.v": np.full((6, 2), 3000.0)}, {}, "metres and seconds"),
+        ({"t": T}, {}, "nothing is measured"),
+        ([], {}, "empty list"),
+        (5.0, {}, "expected a dict, a table or the path"),
+        (GOOD, {"noise": {"cue.y": 1.0}}, "no column 'cue.y'"),
+        (GOOD, {"noise": {"cue.x": 0.0}}, "above 0"),
+        (GOOD, {"noise": {"cue.x": np.ones(5)}}, "shape"),
+        (GOOD, {"observe": {"tip": "cue.x"}}, "no column 'tip'"),
+        (GOOD, {"starts": 0}, "integer >= 1"),
+        (GOOD, {"widths": ()}, "widths"),
+        (GOOD, {"windows": (0.0,)}, "windows"),
+        (GOOD, {"dt": -1.0}, "expected > 0"),
+        ([dr.Record(GOOD, start=0.2)], {}, "make it earlier"),
+        ([dr.Record(GOOD, world=SOLID)], {}, "2D|3D"),
+    ],
+)
+def test_bad_input_of_a_fit(data, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        dr.fit(WORLD, STATE, data, free={"cue.v": dr.real()}, progress=False, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        ({"tip.point": dr.real()}, "no parameter 'tip.point'"),
+        ({"cue.x": dr.direction(), "cue.mass": dr.direction()}, "expected a vector"),
+        ({("cue.mass",): dr.shares()}, "two or more"),
+        ({"cue.x": dr.each(3)}, "expected interval"),
+    ],
+)
+def test_bad_parameters_of_a_fit(free, message):
+    with pytest.raises(ValueError, match=message):
+        dr.fit(WORLD, STATE, GOOD, free=free, progress=False)
+    with pytest.raises(ValueError, match="deviation"):
+        dr.prior(dr.real(), 0.0, 0.0)
+
+
+def test_pieces_of_a_long_record_start_where_it_was_measured():
+    t = np.arange(41) / 20
+    data = {"t": t, "cue.x": np.stack([t, 2 - t], 1), "cue.angle": 0.5 + 4.0 * t}
+    pieces = dr.segments(WORLD, STATE, data, 4)
+    assert len(pieces) == 4 and pieces[0].state is STATE
+    assert_allclose([p.start for p in pieces], [0.0, 0.5, 1.0, 1.5])
+    for piece in pieces[1:]:
+        assert_allclose(piece.state.x[0], (piece.start, 2 - piece.start), atol=1e-9)
+        assert_allclose(piece.state.v[0], (1.0, -1.0), atol=1e-9)
+        assert_allclose(piece.state.w[0], 4.0, atol=1e-9)
+        assert_allclose(piece.observations["cue.x"][0][[0, -1]], (piece.start, piece.start + 0.5))
+
+
+# ---- losses and residuals
+
+
+@pytest.mark.parametrize("loss", [sysid.squares(), dr.huber(), dr.student()])
+def test_weights_are_slopes_over_residuals(loss):
+    for r in (-4.0, -0.3, 0.9, 2.5):
+        assert_allclose(jax.grad(loss.rho)(r), loss.weight(jnp.asarray(r)) * r, rtol=1e-12)
+
+
+def test_residuals_of_noise_are_believed_and_others_are_not():
+    random = np.random.default_rng(0)
+    noise = [random.standard_normal(300) for _ in range(200)]
+    chances = np.array([whiteness([r]) for r in noise])
+    assert_allclose([(chances < p).mean() for p in (0.1, 0.5)], (0.1, 0.5), atol=0.08)  # uniform
+    line = np.polynomial.polynomial.polyvander(np.linspace(-1, 1, 25), 2)
+    basis = np.linalg.qr(line)[0]
+    short = [r[:25] - basis @ (basis.T @ r[:25]) for r in noise]  # what a fit of a parabola leaves
+    assert whiteness(short) > 0.5
+    assert_allclose(np.mean([normality(r) < 0.1 for r in noise]), 0.1, atol=0.08)
+    assert doubts(noise[:3], 1.0) == []
+    drift = noise[0] + np.sin(np.arange(300) / 20)
+    assert "follow each other" in doubts([drift], None)[0]
+    assert any("not normal" in text for text in doubts([noise[0] ** 3], None))
+    assert any("times the noise" in text for text in doubts([3 * noise[1]], 1.0))
+
+
+# ---- files
+
+SCENE = """
+gravity = [0.0, -9.81]
+restitution = 0.5
+ignore = [["a", "b"]]
+contact = { width = 0.01 }
+
+[bodies.a]
+shape = { disc = { radius = 0.1 } }
+mass = 1.0
+x = [0.0, 1.0]
+
+[bodies.b]
+mass = 2.0
+inertia = 0.1
+x = [3.0, 1.0]
+v = [1.0, 0.0]
+
+[statics.floor]
+shape = { half_space = { normal = [0.0, 1.0] } }
+
+[forces]
+air = { drag = { linear = 0.1 } }
+
+[joints]
+rod = { distance = { a = "b", anchor_a = [0.0, 0.0], anchor_b = [3.0, 2.0] } }
+
+[free]
+"b.v" = "real"
+restitution = { interval = [0, 1] }
+"a.mass = b.mass" = { positive = 0.2 }
+
+[observe]
+tip = { marker = { body = "b", point = [0.1, 0.0] } }
+
+[fit]
+starts = 2
+"""
+
+
+def test_a_scene_file_is_the_scene_it_describes(tmp_path):
+    file = tmp_path / "scene.toml"
+    file.write_text(SCENE)
+    found = read_scene(file)
+    world, state = dr.scene(
+        {
+            "a": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0)),
+            "b": dr.Body(None, mass=2.0, inertia=0.1, x=(3.0, 1.0), v=(1.0, 0.0)),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+        },
+        gravity=(0.0, -9.81), restitution=0.5, contact=dr.Contact(width=0.01), ignore=[("a", "b")],
+        forces={"air": dr.Drag(linear=0.1)},
+        joints={"rod": dr.Distance("b", anchor_a=(0.0, 0.0), anchor_b=(3.0, 2.0))},
+    )  # fmt: skip
+    assert jax.tree.structure((found.world, found.state)) == jax.tree.structure((world, state))
+    for ours, theirs in zip(jax.tree.leaves((found.world, found.state)), jax.tree.leaves((world, state)), strict=True):
+        assert_allclose(ours, theirs, rtol=1e-12)
+    free = {"b.v": dr.real(), "restitution": dr.interval(0, 1), ("a.mass", "b.mass"): dr.positive(0.2)}
+    assert found.free == free and found.options == {"starts": 2}
+    assert found.observe["tip"] == dr.Marker("b", point=[0.1, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("[bodies.a]", "[bodys.a]"), "unknown key 'bodys': did you mean 'bodies'"),
+        (("disc = {", "disk = {"), "no 'disk': did you mean 'disc'"),
+        (("radius = 0.1", "radios = 0.1"), "radios"),
+        (('"real"', '"reel"'), "did you mean 'real'"),
+        (("starts = 2", "start = 2"), "did you mean 'starts'"),
+        (("mass = 1.0", "mass = "), "no TOML file"),
+    ],
+)
+def test_mistakes_in_scene_files(tmp_path, change, message):
+    file = tmp_path / "scene.toml"
+    file.write_text(SCENE.replace(*change, 1))
+    with pytest.raises(ValueError, match=message):
+        read_scene(file)
+
+
+def test_fit_from_the_command_line(tmp_path):
+    """A fall: x = v t, y = 1 - g t^2 / 2."""
+    (tmp_path / "scene.toml").write_text(
+        'gravity = [0.0, -9.0]\n[bodies.p]\nmass = 1.0\ninertia = 1.0\nx = [0.0, 1.0]\n[free]\n"gravity" = "real"\n'
+    )
+    lines = [f"{t:.3f},0.0,{1 - 9.81 * t**2 / 2:.9f}" for t in np.arange(12) / 20]
+    (tmp_path / "fall.csv").write_text("\n".join(["t,p.x[0],p.x[1]", *lines]) + "\n")
+    files, said = [str(tmp_path / name) for name in ("scene.toml", "fall.csv")], io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main(["fit", *files, "--out", str(tmp_path / "fit.json")]) == 0
+    assert "gravity[1]" in said.getvalue()
+    saved = dr.load_fit(tmp_path / "fit.json")
+    assert_allclose(saved["gravity"].value, (0.0, -9.81), atol=1e-6)
+    with pytest.raises(SystemExit), contextlib.redirect_stderr(said):
+        main(["fit", files[0], str(Path(tmp_path) / "none.csv")])
+    assert "none.csv" in said.getvalue()
