@@ -85,3 +85,25 @@ def test_cradle_of_touching_balls():
     end = dr.rollout(world, state, dt=1 / 60, steps=120).state
     assert_allclose(end.v[-1], np.eye(6)[4][:, None] * [2.0, 0.0], atol=1e-9)
     assert_allclose(end.x[-1, :, 0], [0.0, 1.0, 2.0, 3.0, 6.0, -1.0], atol=1e-8)
+
+
+def test_a_ball_that_rests_is_struck():
+    """From above and aside, so that it hits the floor at once: slopes by aim, speed and law are those of differences."""
+
+    def end(p):
+        disc = dr.Disc(radius=0.1)
+        bodies = {
+            "cue": dr.Body(
+                disc, mass=1.0, x=jnp.stack([p[0], 0.1785 + 0.0 * p[0]]), v=jnp.stack([p[1], -2.6 + 0.0 * p[1]])
+            ),
+            "ball": dr.Body(disc, mass=0.5, x=(1.0, 0.1)),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+        }
+        world, state = dr.scene(bodies, gravity=(0.0, -9.81), restitution=p[2], friction=p[3])
+        return jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(dr.step(world, state, 1 / 120))])
+
+    at, run = jnp.array([0.809, 0.667, 0.7, 0.3]), jax.jit(end)
+    h = 1e-6 * jnp.eye(4)
+    differences = jnp.stack([(run(at + h[k]) - run(at - h[k])) / 2e-6 for k in range(4)], axis=1)
+    assert float(jnp.abs(differences).max()) > 10.0  # the ball does hit the floor
+    assert_allclose(jax.jit(jax.jacfwd(end))(at), differences, atol=1e-5)

@@ -110,7 +110,7 @@ def _struck(gap: Callable, since: Array, start: Array, dt: Array, at_end: Array)
     """When a limit is struck, (*batch) [s], and whether it is, or is touched where `at_end`.
 
     On a path that goes back to `since`, before the step: so one that was missed there is still taken at its time. One
-    that is open at no time, and closes or rests at the start, is struck at once.
+    that is not open then but is passed at the end is touched at once.
     """
     slack = jnp.sqrt(jnp.finfo(dt.dtype).eps)
     free = lax.stop_gradient(gap(since)) > slack
@@ -125,8 +125,7 @@ def _struck(gap: Callable, since: Array, start: Array, dt: Array, at_end: Array)
         return low, high, jnp.where(within, newton, 0.5 * (low + high))
 
     found = lax.fori_loop(0, SEARCH, closer, lax.stop_gradient((since, dt, 0.5 * (since + dt))))[2]
-    closing = jax.jvp(gap, (start,), (jnp.ones_like(start),))[1] <= slack
-    hit = inside & (free | closing) & ~at_end
+    hit = inside & ~at_end
     s0 = checkpoint_name(lax.stop_gradient(jnp.where(hit & free, found, jnp.where(hit, start, dt))), FOUND)
     value, slope = jax.jvp(gap, (s0,), (jnp.ones_like(s0),))
     s = jnp.where(hit & free, implicit_root(s0, value, lax.stop_gradient(slope)), jnp.where(hit, start, dt))

@@ -69,8 +69,9 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
         arm_a, arm_b = point - at_a.x + shift, point - at_b.x - shift
         pulls = [_acceleration(side, at, s, arm) for side, at, arm in ((a, at_a, arm_a), (b, at_b, arm_b))]
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
+        touching = (gap > 0) & (gap <= slack)  # open by no more than rounding
         return Strikes(
-            active=gap < 0, s=s, gap=gap, normal=normal, arm_a=arm_a, arm_b=arm_b,
+            active=gap < 0, s=s, gap=jnp.where(touching, 0.0, gap), normal=normal, arm_a=arm_a, arm_b=arm_b,
             K=effective_matrix(at_a, arm_a, at_b, arm_b), v_rel=relative_velocity(at_a, arm_a, at_b, arm_b),
             pull=pull, drift=drift,
         )  # fmt: skip

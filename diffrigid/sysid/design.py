@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.state import State
-from diffrigid.sysid.covariance import MANY, Linear, from_jacobian, inverse
-from diffrigid.sysid.diagnosis import blind_directions, coordinates
+from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
+from diffrigid.sysid.diagnosis import blind_directions, coordinates, infinite_where_blind
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Slot, knows, make_slots, put, reference
@@ -91,7 +91,8 @@ def best_launch(
         points = (u[:, None] + shifts[None]).reshape(lanes, count)
         states = [put(slots, scene, jnp.asarray(p, scene.state.x.dtype)).state for p in points]
         found = _problem(world, state, states, planned, free, noise, observe, dt)
-        value = np.array([_score(linear) for linear in _linears(found)]).reshape(starts, -1)
+        each = [_score(_covariance(found, k, linear)) for k, linear in enumerate(_linears(found))]
+        value = np.array(each).reshape(starts, -1)
         return value[:, 0], (value[:, 1 : count + 1] - value[:, count + 1 :]) / (2 * NUDGE)
 
     u = np.stack([first(k) for k in range(starts)])
@@ -137,15 +138,23 @@ def _linears(problem: Problem) -> list[Linear]:
     return [Linear((r,), (J,), (t,), linear.shared, 1.0, False) for r, J, t in rows]
 
 
-def _score(linear: Linear) -> float:
-    """Mean logarithm of the standard deviations along the axes of the ellipsoid."""
-    information = inverse(from_jacobian(linear).covariance)
-    sign, logarithm = np.linalg.slogdet(information)
-    return float(-0.5 * logarithm / len(information)) if sign > 0 and np.isfinite(logarithm) else MANY
+def _covariance(problem: Problem, record: int, linear: Linear) -> np.ndarray:
+    """Of the shared numbers, infinite where a record does not see them."""
+    slots, scene = (*problem.shared, *problem.own), scene_of(problem.runs[record])
+    places = coordinates(slots, [np.asarray(reference(slot, scene)) for slot in slots])
+    return infinite_where_blind(from_jacobian(linear).covariance, blind_directions(linear, places), linear.shared)
+
+
+def _score(covariance: np.ndarray) -> float:
+    """Mean logarithm of the standard deviations along the axes of the ellipsoid; large if one has no end."""
+    if not np.isfinite(covariance).all():
+        return MANY
+    sign, logarithm = np.linalg.slogdet(covariance)
+    return float(0.5 * logarithm / len(covariance)) if sign > 0 and np.isfinite(logarithm) else MANY
 
 
 def _parameters(problem: Problem, record: int, linear: Linear) -> tuple[Parameter, ...]:
-    covariance, (z, _) = from_jacobian(linear).covariance, first_numbers(problem)
+    covariance, (z, _) = _covariance(problem, record, linear), first_numbers(problem)
     out, first = [], 0
     for slot in problem.shared:
         rows = slice(first, first + slot.size)
