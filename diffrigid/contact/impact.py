@@ -67,8 +67,9 @@ def find_impact(
     share = closing.astype(s0.dtype) / jnp.maximum(closing.sum(0), 1)[None].astype(s0.dtype)
     s = implicit_root(s0, (share * moved.gap).sum(0) - level, (share * speed).sum(0))
     # What is already inside where the paths begin is struck there, whatever its gap.
-    at_once = jnp.any(closing & (gap < lax.stop_gradient(level - slack)[None]), 0)
-    s = jnp.where(at_once, _earliest(a, b)[0], s)
+    begin = _earliest(a, b)[0]
+    at_once = jnp.any(closing & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
+    s = jnp.where(at_once, begin, s)
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
     return s, hit | at_end, level, slack
 
