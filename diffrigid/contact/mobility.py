@@ -98,6 +98,13 @@ def twists(P: Array, arms: Any, mobility: Mobility) -> Array:
     return jnp.concatenate([dv, dw], axis=1).reshape(-1, *P.shape[2:])
 
 
+def at_contacts(arms: Any, twist: Array) -> Array:
+    """J u: `relative_changes` for the twists of all bodies in one, (C, *batch)."""
+    D = arms.arm_a.shape[1]
+    by_body = twist.reshape(-1, D + rotations(D).A, *twist.shape[1:])
+    return relative_changes(arms, by_body[:, :D], by_body[:, D:])
+
+
 def bodies_inverse(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     """Inverse of 1 + G J^T A J, (R, R, *batch) with R components of the twists of all bodies.
 

@@ -20,15 +20,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.contact.cone import Cone, nearest
-from diffrigid.contact.mobility import Mobility, bodies_inverse, relative_changes, twists
-from diffrigid.numerics import dot, norm
+from diffrigid.contact.cone import Cone, nearest, split
+from diffrigid.contact.mobility import Mobility, at_contacts, bodies_inverse, twists
+from diffrigid.numerics import norm
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most
-SOFTNESS = (
-    1e-2  # [-] 1 / (sigma k): what a round leaves of the error in P, and the stiffness that Newton's method meets
-)
+SOFTNESS = 1e-2  # [-] 1 / (sigma k): about what a round leaves of the error in P
 READY = 1e-2  # [-] of u: an error of the inner problem at which the multipliers are taken anew
 HALVINGS = 10  # of a step along its line
 
@@ -43,32 +41,27 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
     sigma = (1.0 / (SOFTNESS * cone.scale))[:, None]
     D = v_rel.shape[1]
 
-    def pushed(P: Array, y: Array) -> tuple[Array, Array]:
-        y_t = y - jax.vmap(dot)(cone.normal, y)[:, None] * cone.normal
+    def pushed(P: Array, y: Array) -> Array:
+        _, y_t = split(cone.normal, y)
         opening = cone.mu * jax.vmap(norm)(y_t) - cone.target
-        z = P - sigma * (y + opening[:, None] * cone.normal)
-        return nearest(cone, z), z
-
-    def relative(u: Array) -> Array:
-        by_body = u.reshape(-1, D + rotations(D).A, *u.shape[1:])
-        return relative_changes(arms, by_body[:, :D], by_body[:, D:])
+        return nearest(cone, P - sigma * (y + opening[:, None] * cone.normal))
 
     def again(carry):
         count, u, P, best, least = carry
-        y = v_rel + relative(u)
-        F, z = pushed(P, y)
+        y = v_rel + at_contacts(arms, u)
+        F = pushed(P, y)
         new = error(F)
         best, least = jnp.where((new < least)[None, None], F, best), jnp.minimum(new, least)
         ready = _size(u - twists(F, arms, mobility), mobility, D) < READY * _size(u, mobility, D)
         P = jnp.where(ready[None, None], F, P)
-        F, z = pushed(P, y)
+        F = pushed(P, y)
         off = u - twists(F, arms, mobility)
-        inverse = bodies_inverse(lambda dy: -jax.jvp(lambda y: pushed(P, y)[0], (y,), (dy,))[1], arms, mobility)
+        inverse = bodies_inverse(lambda dy: -jax.jvp(lambda y: pushed(P, y), (y,), (dy,))[1], arms, mobility)
         du = -(inverse * off[None]).sum(1)
-        dy, weight = relative(du), _momenta(du, mobility, D)
+        dy, weight = at_contacts(arms, du), _momenta(du, mobility, D)
 
         def ahead(share: Array) -> Array:  # slope of the convex function there
-            F = pushed(P, y + share[None, None] * dy)[0]
+            F = pushed(P, y + share[None, None] * dy)
             return (weight * (u + share[None] * du - twists(F, arms, mobility))).sum(0)
 
         return count + 1, u + _down(ahead, jnp.ones_like(least))[None] * du, P, best, least

@@ -29,19 +29,10 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.contact.cone import Cone, allowed, split
-from diffrigid.contact.mobility import (
-    Arms,
-    Mobility,
-    bodies_inverse,
-    momentum_changes,
-    relative_changes,
-    twists,
-    velocities,
-)
+from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_inverse, twists
 from diffrigid.contact.multipliers import solve_roughly
 from diffrigid.numerics import FOUND, dot, norm, safe_divide
 from diffrigid.pytree import array, pytree
-from diffrigid.state import rotations
 
 ROUNDS = 40  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start
@@ -71,8 +62,7 @@ def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) 
 
 def _moved(P: Array, arms: Arms, mobility: Mobility) -> Array:
     """W P: changes of the relative velocities, (C, D, *batch) [m/s]."""
-    dv, dw, _ = velocities(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
-    return relative_changes(arms, dv, dw)
+    return at_contacts(arms, twists(P, arms, mobility))
 
 
 def _slope(cone: Cone, z: Array) -> Slope:
@@ -116,9 +106,7 @@ def _answer(slope: Slope, cone: Cone) -> Callable[[Array], Array]:
 
 def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
     """B^-1 D J / k of the twists (C, *batch) of all bodies: impulses, (C, D, *batch)."""
-    D = arms.arm_a.shape[1]
-    by_body = twist.reshape(-1, D + rotations(D).A, *twist.shape[1:])
-    return _answer(slope, cone)(relative_changes(arms, by_body[:, :D], by_body[:, D:]))
+    return _answer(slope, cone)(at_contacts(arms, twist))
 
 
 def _newton_step(r: Array, inverse: Array, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
