@@ -236,7 +236,7 @@ def build_diffrigid(scene):
     return dr.scene(
         bodies | walls,
         contact=dr.Contact(sweeps=1),
-        gravity=(0.0,) * (len(scene.x[0]) - 1) + (-scene.gravity,),
+        gravity=(0.0,) * (len(scene.x[0]) - 1) + (-scene.gravity,) if scene.gravity else None,
         restitution=scene.restitution,
         friction=scene.friction,
         joints=joints if scene.chain else (),

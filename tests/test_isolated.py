@@ -91,3 +91,17 @@ def test_a_disc_falls_on_a_disc_that_stands_still():
     value, slopes = jax.value_and_grad(height, argnums=(0, 1))(0.8, 0.5, 0.0)
     assert_allclose(value, 0.3 + 0.64 * 0.5, rtol=1e-12)
     assert_allclose(slopes, (2 * 0.8 * 0.5, 0.64), rtol=1e-9)
+
+
+def test_more_discs_than_sweeps_strike_one_floor_in_a_step():
+    """Each at a time of its own: x = speed t, rebound with e = 1/2 from there on."""
+    speed, gap, dt = 1.0 + np.arange(6.0), 0.01 * np.arange(1.0, 7.0), 0.05
+    bodies = {
+        f"d{k}": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(k, 0.1 + gap[k]), v=(0.0, -speed[k])) for k in range(6)
+    }
+    for k, (n, offset) in enumerate([((0.0, 1.0), 0.0), ((1.0, 0.0), -1.0), ((-1.0, 0.0), -9.0), ((0.0, -1.0), -9.0)]):
+        bodies[f"wall{k}"] = dr.Static(dr.HalfSpace(normal=n, offset=offset))
+    world, state = dr.scene(bodies, restitution=0.5)
+    assert isolated.is_crowded(world) and world.contact.sweeps < 6
+    end = dr.rollout(world, state, dt=dt, steps=1).state
+    assert_allclose(end.x[-1, :, 1] - 0.1, 0.5 * (speed * dt - gap), rtol=1e-12)

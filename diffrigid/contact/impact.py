@@ -149,13 +149,18 @@ def _approach_parabola(a: Side, b: Side, width: Array | None) -> tuple[Array, Ar
     return jnp.where(sunk | (s < bound), start, s), level, found, root
 
 
-def meet_on_parabola(gap: Array, v: Array, acc: Array, width: Array | None):
+def meet_on_parabola(gap: Array, v: Array, acc: Array | None, width: Array | None):
     """A round shape and a half-space at rest: gap(s) = gap + v s + acc s^2 / 2, exactly; all (*batch).
+
+    Args:
+        acc: None where nothing accelerates.
 
     Returns:
         s, level, whether they meet and closing speed as `meet_on_line`; whether it is inside and sinks, with no
         crossing in the past: then the impact is at once.
     """
+    if acc is None:
+        return safe_divide(gap, -v), jnp.zeros_like(gap), v < 0, -v, False
     turns_back = acc > 0
     gap_min = gap - 0.5 * safe_divide(v * v, jnp.where(turns_back, acc, 0.0))
 

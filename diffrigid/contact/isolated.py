@@ -1,34 +1,35 @@
 """Impacts of round shapes that are alone on their bodies: the usual step of a world of many discs or spheres.
 
 The general pass evaluates every contact of every pair. Here only the *times* are found for all pairs, without
-derivative, and each body keeps its next one. The next few impacts of each world then go into `slots`, and only
-these are evaluated.
+derivative, and each body keeps its next one. The impacts of each world then go into `slots`, a few at a time, and
+only these are evaluated.
 
 A pass goes this way if it is an impact pass and, in all worlds of the batch, no body is in two contacts at the
-same time, none comes to rest, and the slots suffice; else the general way, to the same result.
+same time and none comes to rest; else the general way, to the same result.
 """
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.collide import PairGroup
+from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
 from diffrigid.contact.sides import Side
-from diffrigid.contact.slots import Slots, Table, fold, sides_of_table, summed
+from diffrigid.contact.slots import Slots, Table, fold, meet, sides_of_table, sum_of_terms, summed
 from diffrigid.contact.strikes import Material, material, mixed, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
-from diffrigid.numerics import apart, constant, dot, safe_sqrt
+from diffrigid.numerics import apart, constant, dot
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
 RESTS = -1e30  # [s] stands for an impact after which bodies stay together
 CROWDED = 4  # pairs per body from which this way is faster than the list of pairs
-SHARE = 4  # bodies for each slot
+ROUNDS = 8  # in which the impacts of a pass are taken; most worlds need no more than one
 
 
 def is_crowded(world: Any) -> bool:
@@ -61,68 +62,134 @@ def tables_of(world: Any) -> tuple[Table, ...]:
     return tuple(map(table, world.pairs))
 
 
+class Next(NamedTuple):
+    """The next impact of each body in this step: into which slot of its world it goes, and with what."""
+
+    lead: Array  # (N, *batch) 1 for a body that has a slot, of two the first; else 0
+    rank: Array  # (N, *batch) number of that slot
+    other: Array  # (N, *batch) the other collider, a body or a static
+
+
 def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: Array, dt: Array):
-    """The impacts of this step that are the next one of both bodies.
+    """The next impact of each body, if any.
 
     Returns:
-        slots; whether they hold all of these impacts and all are isolated, exact and do not rest, a bool; whether
-        there are any, a bool.
+        next impacts; whether all are isolated, exact and do not rest, a bool; how many slots the fullest world needs.
     """
     moving, live = len(world.names), jnp.any(dt > 0)
     tie = (jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt)[None]
+    many = 1 + max(max(table.b) for table in tables)
 
-    def of_bodies(soonest):
-        first = later = jnp.full_like(soonest[0][0], jnp.inf)
-        for least, following, _ in soonest:
-            later = jnp.minimum(jnp.maximum(first, least), jnp.minimum(later, following))
-            first = jnp.minimum(first, least)
-        first = jnp.where(first <= dt[None], first, jnp.inf)
-        return first, jnp.all((first == jnp.inf) | ((later > first + tie) & (first > RESTS)))
+    def first_of(times):
+        soonest = [fold(jnp.minimum, t, axis=1) for t in times]
+        return functools.reduce(jnp.minimum, soonest)
 
-    # Apart: times are compared with each other below, and must not be computed twice with another rounding.
-    soonest = [_soonest(live, world, table, flight, since, dt) for table in tables]
-    first, alone = apart(live, of_bodies, soonest)
-    s = apart(live, functools.partial(_in_order, count=-(-moving // SHARE)), first)
-    slots, ties = _slots(live, moving, tables, soonest, first, s, tie)
-    too_many = jnp.any((first > s[-1][None]) & (first < jnp.inf))
-    isolated = alone & ~too_many & ~ties & ~jnp.any(world.contact.width > 0)
-    return slots, isolated, jnp.any(s[0] < jnp.inf)
+    def with_what(times, first):
+        """Number of the collider that a body meets first; `many` and more if it meets two then."""
+        total = jnp.full_like(first, -many)
+        for table, t in zip(tables, times, strict=True):
+            for k, b in enumerate(table.b):
+                total = total + jnp.where(t[:, k] <= first + tie, float(many + b), 0.0)
+        return total
+
+    def in_slots(first, other):
+        hit = first <= dt[None]
+        lead = (hit & (other > lax.broadcasted_iota(other.dtype, other.shape, 0))).astype(other.dtype)
+        alone = fold(jnp.logical_and, ~hit | ((other < many) & (first > RESTS)), 0)
+        return lead, jnp.where(hit, other, -1.0), jnp.all(alone)
+
+    # Apart: times are compared with each other, and must not be computed twice with another rounding.
+    times = [_times(live, world, table, flight, since, dt) for table in tables]
+    first = apart(live, first_of, times)
+    lead, other, alone = apart(live, in_slots, first, apart(live, with_what, times, first))
+    before = constant(tuple(tuple(float(i < j) for j in range(moving)) for i in range(moving)), str(dt.dtype))
+    rank = sum_of_terms(lax.expand_dims(before, range(2, 1 + lead.ndim)), lead[:, None], 0)[:, 0]
+    needed = jnp.max(fold(jnp.add, lead, 0))
+    isolated = alone & ~jnp.any(world.contact.width > 0)
+    return Next(lead, rank, other), isolated, needed
 
 
-def _soonest(live: Array, world: Any, table: Table, flight: Flight, since: Array, dt: Array) -> tuple:
-    """Times of the next impacts with one side of a table [s]; inf: none in this step; RESTS: without rebound.
+def meet_in_rounds(
+    world: Any, tables: tuple[Table, ...], following: Next, needed: Array, anchors: Anchors, launch: Any, dt: Array
+) -> Anchors:
+    """The anchors after the next impact of each body; rounds that no world needs are left out."""
+    count, live = slots_of(len(world.names)), jnp.any(dt > 0)
 
-    Returns:
-        (N, *batch) of each body the first and, against statics, the second; (B, *batch) of each static the first.
-    """
+    @jax.checkpoint
+    def meet_from(begin, anchors):
+        return meet(world, tables, fill_slots(tables, count, following, begin, live), anchors, launch, dt)
+
+    def one_round(anchors, begin):
+        return lax.cond(needed > begin, meet_from, lambda _, anchors: anchors, begin, anchors), None
+
+    begins = constant(tuple(float(count * k) for k in range(ROUNDS)), str(dt.dtype))
+    return lax.scan(one_round, anchors, begins)[0]
+
+
+def slots_of(moving: int) -> int:
+    """Slots of a round. All rounds together have one for each body."""
+    return -(-moving // ROUNDS)
+
+
+def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Array, live: Array) -> Slots:
+    """The impacts of a round as slots: those numbered from `begin`, which both bodies have as their next one."""
+    moving = len(following.rank)
+
+    def weights(following: Next) -> Array:
+        shape = (count, *following.rank.shape)
+        number = begin + lax.broadcasted_iota(begin.dtype, shape, 0)
+        return jnp.where(following.rank[None] == number, following.lead[None], 0.0)
+
+    def sides(a: Array, following: Next) -> tuple[Array, Array]:
+        """The first body and the other collider of each slot, (E, *batch); -1 where it is empty."""
+        body = lax.broadcasted_iota(a.dtype, a.shape, 1)
+        empty = summed(a) - 1.0
+        return summed(a * body) + empty, summed(a * following.other[None]) + empty
+
+    def of_b(body: Array, other: Array, following: Next) -> tuple[Array, ...]:
+        def there(table: Table) -> Array:
+            number = constant(table.b, str(other.dtype)).reshape(1, -1, *[1] * (other.ndim - 1))
+            chosen = other[:, None] == number
+            if table.b[0] < moving:
+                chosen = chosen & (following.other[None] == body[:, None])
+            return chosen.astype(other.dtype)
+
+        return tuple(map(there, tables))
+
+    a = apart(live, weights, following)
+    return Slots(a, apart(live, of_b, *apart(live, sides, a, following), following))
+
+
+def _times(live: Array, world: Any, table: Table, flight: Flight, since: Array, dt: Array) -> Array:
+    """Times of the next impacts (A, B, *batch) [s]; inf: none in this step; RESTS: without rebound."""
     a, b = sides_of_table(world, table, flight, since)
     if table.b[0] < a.flight.t0.shape[0]:
-        times = apart(live, functools.partial(_times_of_pairs, world, table), a, since, dt)
-        least = apart(live, functools.partial(fold, jnp.minimum, axis=1), times)
-        return least, jnp.full_like(least, jnp.inf), None
-    times = apart(live, functools.partial(_times_to_statics, world, table), a, b, dt)
-    return *apart(live, _two_smallest, times), apart(live, functools.partial(fold, jnp.minimum, axis=0), times)
+        return _times_of_pairs(world, table, a, since, dt)
+    return apart(live, functools.partial(_times_to_statics, world, table), a, b, dt)
 
 
 def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Array) -> Array:
     """Time of the next impact of each body with each other, (N, N, *batch) [s]: `meet_on_line`, without derivative."""
-    zero = jnp.zeros_like(bodies.flight.t0)
-    x, v = jax.vmap(position)(bodies.flight, zero), jax.vmap(velocity)(bodies.flight, zero)
+
+    def at_start(flight: Flight) -> tuple[Array, Array]:
+        zero = jnp.zeros_like(flight.t0)
+        return jax.vmap(position)(flight, zero), jax.vmap(velocity)(flight, zero)
 
     def one(a: tuple, b: tuple) -> Array:
         (x_a, v_a, t_a, since_a, radius_a), (x_b, v_b, t_b, since_b, radius_b) = a, b
         P, W, R, start = x_a - x_b, v_a - v_b, radius_a + radius_b, jnp.maximum(t_a, t_b)
         W2, PW, excess = dot(W, W), dot(P, W), dot(P, P) - R * R
         D = PW * PW - W2 * excess
-        root = safe_sqrt(D)
+        root = jnp.sqrt(jnp.maximum(D, 0.0))
         closing = (D > 0) & (PW + start * W2 < 0)  # 0 for a body and itself
         s = jnp.where(closing, excess / (root - PW), jnp.inf)
         s = jnp.where(s < jnp.maximum(since_a, since_b), start, s)
         rests = (root <= world.contact.rest_speed * R) & (s <= dt)
         return jnp.where(rests, RESTS, s)
 
-    lines = (x, v, bodies.flight.t0, since, bodies.shape.radius)
-    return _allowed(table, jax.vmap(jax.vmap(one, (None, 0)), (0, None))(lines, lines))
+    live = jnp.any(dt > 0)
+    lines = (*apart(live, at_start, bodies.flight), bodies.flight.t0, since, bodies.shape.radius)
+    return _allowed(table, apart(live, jax.vmap(jax.vmap(one, (None, 0)), (0, None)), lines, lines))
 
 
 def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
@@ -141,6 +208,7 @@ def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> 
 
 def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
     so, live, f = rotations(a.flight.dim), jnp.any(dt > 0), a.flight
+    straight = relative_path_is_straight(world, both_move=False)
     own, others = (material(world, "restitution", of) for of in (tuple(range(len(world.names))), table.b))
 
     def planes(b: Side, own: Material, others: Material) -> tuple:
@@ -150,10 +218,10 @@ def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> A
 
     def one(body: tuple, plane: tuple, twice_e: Array) -> Array:
         (x, v, acc, t0, since, radius), (n, offset) = body, plane
-        acc = dot(n, acc)
+        acc = None if straight else dot(n, acc)
         s, _, found, u, sunk = meet_on_parabola(dot(n, x) - offset - radius, dot(n, v), acc, None)
         s = jnp.where(sunk | (t0 + s < since), t0, t0 + s)
-        rests = (u <= world.contact.rest_speed) | (twice_e * u <= -acc * (dt - s))
+        rests = (u <= world.contact.rest_speed) | (twice_e * u <= (0.0 if acc is None else -acc * (dt - s)))
         return jnp.where(found, jnp.where(rests & (s <= dt), RESTS, s), jnp.inf)
 
     n, offset, twice_e = apart(live, planes, b, own, others)
@@ -168,62 +236,3 @@ def _allowed(table: Table, times: Array) -> Array:
         return times
     allowed = constant(table.allowed, str(times.dtype))
     return jnp.where(lax.expand_dims(allowed, range(2, times.ndim)) > 0, times, jnp.inf)
-
-
-def _slots(live: Array, moving: int, tables: tuple, soonest: list, first: Array, s: Array, tie: Array):
-    """The impacts at the times s (E, *batch), as slots, and whether two share a body or cannot be told apart."""
-
-    def taking_part(soonest, first, s):
-        """(E, N, *batch) for each table: 1 for bodies whose next impact is then and of this kind; how many."""
-        now = (first[None] == s[:, None]) & (s < jnp.inf)[:, None]
-        return [(now & (least[None] == s[:, None])).astype(s.dtype) for least, *_ in soonest]
-
-    bodies = apart(live, taking_part, soonest, first, s)
-    counts = apart(live, lambda bodies: [summed(now) for now in bodies], bodies)
-    total, void = sum(counts), jnp.zeros_like(s, bool)
-    fine = total == 0
-    for table, n in zip(tables, counts, strict=True):
-        both = table.b[0] < moving
-        void = void | (n == 1) if both else void
-        fine = fine | ((n == total) & ((n <= 2) if both else (n == 1)))
-    near = (s[1:] - s[:-1] <= tie) & (void[1:] | void[:-1])  # inf - inf is not
-
-    def lowest(now, n):
-        number = lax.broadcasted_iota(s.dtype, now.shape, 1)
-        return jnp.where(n == 2, fold(jnp.minimum, jnp.where(now > 0, number, moving), 1), moving)
-
-    def weights(soonest, bodies, counts, lowest, s):
-        of_a, of_b = 0.0, []
-        for table, now, n, k, (_, _, column) in zip(tables, bodies, counts, lowest, soonest, strict=True):
-            if table.b[0] < moving:
-                a = (lax.broadcasted_iota(s.dtype, now.shape, 1) == k[:, None]).astype(s.dtype)
-                of_b.append(jnp.where((n == 2)[:, None], now - a, 0.0))
-            else:
-                a = now
-                of_b.append((column[None] == s[:, None]).astype(s.dtype) * n[:, None])
-            of_a = of_a + a
-        return Slots(of_a, tuple(of_b))
-
-    firsts = [
-        apart(live, lowest, now, n) if table.b[0] < moving else None
-        for table, now, n in zip(tables, bodies, counts, strict=True)
-    ]
-    return apart(live, weights, soonest, bodies, counts, firsts, s), ~jnp.all(fine) | jnp.any(near)
-
-
-def _in_order(first: Array, count: int) -> Array:
-    """The `count` least different values of (N, *batch) over the bodies, ascending; inf where there are fewer."""
-
-    def following(s, _):
-        s = fold(jnp.minimum, jnp.where(first > s[None], first, jnp.inf), 0)
-        return s, s
-
-    return lax.scan(following, jnp.full_like(first[0], -jnp.inf), None, length=count)[1]
-
-
-def _two_smallest(table: Array) -> tuple[Array, Array]:
-    """The smallest and the next of each row of a table (A, B, *batch)."""
-    least, following = table[:, 0], jnp.full_like(table[:, 0], jnp.inf)
-    for k in range(1, table.shape[1]):
-        least, following = jnp.minimum(least, table[:, k]), jnp.minimum(following, jnp.maximum(least, table[:, k]))
-    return least, following

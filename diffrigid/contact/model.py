@@ -24,12 +24,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
-from diffrigid.contact.isolated import is_crowded, next_impacts, tables_of
+from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
 from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.resting import Strikes, solve_impulses
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
-from diffrigid.contact.slots import meet
 from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.linkage import islands, linkage, spread
@@ -87,17 +86,12 @@ class Contact:
 
         tables = tables_of(world) if is_crowded(world) else ()
 
-        @jax.checkpoint
-        def meet_in_slots(anchors, slots):
-            return meet(world, tables, slots, anchors, launch, dt)
-
         def isolated_or_any(anchors, resting, found, rests, phase):
             flight = lax.stop_gradient(launch(anchors.state, anchors.t0))
-            slots, isolated, found = next_impacts(world, tables, flight, anchors.since, dt)
+            following, isolated, needed = next_impacts(world, tables, flight, anchors.since, dt)
 
             def isolated_pass():
-                met = lax.cond(found, meet_in_slots, lambda anchors, _: anchors, anchors, slots)
-                return met, resting, found, rests
+                return meet_in_rounds(world, tables, following, needed, anchors, launch, dt), resting, needed > 0, rests
 
             def any_pass():
                 return one_pass(anchors, resting, found, rests, phase)

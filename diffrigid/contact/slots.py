@@ -161,13 +161,13 @@ def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
         return jnp.pad(values, [(0, size - values.shape[0]), *[(0, 0)] * (values.ndim - 1)])
 
     def along(axis):
-        return lambda _, values: filled(_sum_of_terms(weights, values[: weights.shape[axis]], axis))
+        return lambda _, values: filled(sum_of_terms(weights, values[: weights.shape[axis]], axis))
 
     total = lax.custom_linear_solve(lambda values: values, filled(values), along(axis), along(1 - axis))
     return total[: weights.shape[1 - axis]]
 
 
-def _sum_of_terms(weights: Array, values: Array, axis: int) -> Array:
+def sum_of_terms(weights: Array, values: Array, axis: int) -> Array:
     # Term by term: XLA's own reduction of such a product takes twice the time.
     def add(total, term):
         k, value = term
