@@ -5,7 +5,7 @@ derivative, and each body keeps its next one. The impacts of each world then go 
 only these are evaluated.
 
 A pass goes this way if it is an impact pass and, in all worlds of the batch, no body is in two contacts at the
-same time and none comes to rest; else the general way, to the same result.
+same time, none comes to rest, and the slots suffice; else the general way, to the same result.
 """
 
 import functools
@@ -29,7 +29,8 @@ from diffrigid.state import rotations
 
 RESTS = -1e30  # [s] stands for an impact after which bodies stay together
 CROWDED = 4  # pairs per body from which this way is faster than the list of pairs
-ROUNDS = 8  # in which the impacts of a pass are taken; most worlds need no more than one
+SHARE = 8  # bodies for each slot of a round
+ROUNDS = 3  # in which the impacts of a pass are taken; most need one, and reverse mode pays for each
 
 
 def is_crowded(world: Any) -> bool:
@@ -74,7 +75,8 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
     """The next impact of each body, if any.
 
     Returns:
-        next impacts; whether all are isolated, exact and do not rest, a bool; how many slots the fullest world needs.
+        next impacts; whether the slots hold them and all are isolated, exact and do not rest, a bool; how many slots
+        the fullest world needs.
     """
     moving, live = len(world.names), jnp.any(dt > 0)
     tie = (jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt)[None]
@@ -105,7 +107,7 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
     before = constant(tuple(tuple(float(i < j) for j in range(moving)) for i in range(moving)), str(dt.dtype))
     rank = sum_of_terms(lax.expand_dims(before, range(2, 1 + lead.ndim)), lead[:, None], 0)[:, 0]
     needed = jnp.max(fold(jnp.add, lead, 0))
-    isolated = alone & ~jnp.any(world.contact.width > 0)
+    isolated = alone & (needed <= ROUNDS * slots_of(moving)) & ~jnp.any(world.contact.width > 0)
     return Next(lead, rank, other), isolated, needed
 
 
@@ -127,8 +129,8 @@ def meet_in_rounds(
 
 
 def slots_of(moving: int) -> int:
-    """Slots of a round. All rounds together have one for each body."""
-    return -(-moving // ROUNDS)
+    """Slots of a round."""
+    return -(-moving // SHARE)
 
 
 def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Array, live: Array) -> Slots:
