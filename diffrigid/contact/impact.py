@@ -27,7 +27,7 @@ from diffrigid.contact.sides import (
     reach_of,
     relative_acceleration,
 )
-from diffrigid.numerics import FOUND, dot, implicit_root, norm, safe_divide, safe_sqrt, softplus
+from diffrigid.numerics import FOUND, apart, dot, implicit_root, norm, safe_divide, safe_sqrt, softplus
 from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere
 from diffrigid.state import rotations
 
@@ -54,12 +54,15 @@ def find_impact(
 
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
     """
-    s0, level, found, _ = approach(a, b, t1, width, straight)
+    live = jnp.any(t1 > 0)
+    if closed_form(a.shape, b.shape, straight):
+        s0, level, found = apart(live, lambda *args: approach(*args, straight)[:3], a, b, t1, width)
+    else:
+        s0, level, found, _ = approach(a, b, t1, width, straight)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     s0, hit = checkpoint_name((s0, hit), FOUND)
     slack = jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.minimum(reach_of(a), reach_of(b))
-    live = jnp.any(t1 > 0)
     at_a, at_b = place(a, s0, live), place(b, s0, live)
     moved = contacts_of(a, at_a, b, at_b)
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
