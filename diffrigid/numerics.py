@@ -122,6 +122,22 @@ def constant(table: tuple, dtype: str) -> np.ndarray:
     return np.array(table, dtype)
 
 
+@jax.custom_jvp
+def with_tangents(tree: Any, by: Any) -> Any:
+    """`tree` itself, all of whose leaves have a tangent as soon as one of its own or of `by` has.
+
+    Forward mode traces the body of a loop again until it knows which parts of what is carried have a tangent. So
+    that each has one from the beginning: a third of the time before the first fit of colliding discs.
+    """
+    del by
+    return tree
+
+
+@with_tangents.defjvp
+def _with_tangents_jvp(primals, tangents):
+    return primals[0], tangents[0]
+
+
 def safe_sqrt(x: Array) -> Array:
     """Square root, 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite)."""
     positive = x > 0

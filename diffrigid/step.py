@@ -12,6 +12,7 @@ from jax import Array, lax
 
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
+from diffrigid.numerics import with_tangents
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.state import State
 from diffrigid.world import World, check
@@ -166,8 +167,8 @@ def scan_steps(world: World, state: State, intervals: Array, controls: Any, coun
         state = one_step(state, *inputs)
         return state, state
 
-    block = _block_length(state, len(owner))
-    _, states = _blocked_scan(record, state, (lengths, controls), len(owner), block)
+    block, start = _block_length(state, len(owner)), with_tangents(state, (world, intervals, controls))
+    _, states = _blocked_scan(record, start, (lengths, controls), len(owner), block)
     ends = np.cumsum(counts) - 1
     if len(owner) != len(counts):
         states = jax.tree.map(lambda leaf: leaf[ends], states)
@@ -181,6 +182,7 @@ def final_state(world: World, state: State, dt: Array, steps: int) -> State:
     def record(state, dt):
         return one_step(state, dt, None), None
 
+    state = with_tangents(state, (world, dt))
     return _blocked_scan(record, state, jnp.full((steps,), dt), steps, _block_length(state, steps))[0]
 
 

@@ -32,7 +32,7 @@ from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.linkage import islands, linkage, spread
-from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide
+from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
@@ -67,7 +67,7 @@ class Contact:
         t0 = jnp.zeros_like(state.x[:, 0])
         if not ends(world)["a"]:
             return state_at(launch(state, t0), dt)
-        start = Anchors(state=state, t0=t0, since=t0 - dt[None])
+        start = with_tangents(Anchors(state=state, t0=t0, since=t0 - dt[None]), (world, dt))
         # In a crowd some pair is always near, and times are found fast.
         near = jnp.asarray(True) if is_crowded(world) else may_meet(world, launch(state, t0), dt)
         end = self._passes(world, start, launch, dt, near)

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.problem import Group, linearise
+from diffrigid.sysid.problem import QUICK, Group, linearise
 
 STIFF = 1e7  # a damping at which no step is taken any more
 SMALL = 1e-9  # a decrease still to be had, relative to the cost of one residual, that is nothing
@@ -129,7 +129,7 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
     return Arrow(A, B, D, eq.g * free[None], eq.h)
 
 
-@partial(jax.jit, static_argnames=("loss", "members"), compiler_options={"xla_cpu_use_fusion_emitters": False})
+@partial(jax.jit, static_argnames=("loss", "members"), compiler_options=QUICK)
 def update(
     loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
 ) -> tuple[Progress, Numbers]:
