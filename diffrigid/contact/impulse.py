@@ -31,6 +31,18 @@ JAMMED = (
 )
 
 
+def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -> Array:
+    """Coefficient of restitution of an impact with closing speed u [m/s], e = restitution (1 + falloff u)^(-1/4).
+
+    The power is that of impacts in which the material yields, whatever the solid: e ~ u^(-1/4). Slow ones have the
+    whole restitution. Without falloff [s/m], or with 0, it is constant. All (*batch); smooth.
+    Source: Johnson, Contact Mechanics (1985), 11.5.
+    """
+    if falloff is None:
+        return restitution
+    return restitution / jnp.sqrt(jnp.sqrt(1.0 + falloff * jnp.where(u > 0, u, 0.0)))
+
+
 def effective_matrix(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
     """K, (D, D, *batch) [1/kg]: change of the relative velocity for a unit impulse at these arms (D, *batch) [m]."""
     K: Any = 0.0

@@ -17,9 +17,10 @@ from jax import Array, lax
 
 from diffrigid.collide import PairGroup
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
+from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.sides import Side
 from diffrigid.contact.slots import Slots, Table, fold, sides_of_table, summed
-from diffrigid.contact.strikes import Material, material, mixed, relative_path_is_straight
+from diffrigid.contact.strikes import materials, mixed, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
 from diffrigid.numerics import apart, constant, dot, safe_sqrt
@@ -141,19 +142,21 @@ def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> 
 
 def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
     so, live, f = rotations(a.flight.dim), jnp.any(dt > 0), a.flight
-    own, others = (material(world, "restitution", of) for of in (tuple(range(len(world.names))), table.b))
+    names = ("restitution", "restitution_falloff")
+    own, others = (materials(world, of, names) for of in (tuple(range(len(world.names))), table.b))
 
-    def planes(b: Side, own: Material, others: Material) -> tuple:
+    def planes(b: Side, own: list, others: list) -> tuple:
         n = jax.vmap(so.rotate)(b.q, b.shape.normal)
-        e = jax.vmap(jax.vmap(mixed, (None, 0)), (0, None))(own, others)
-        return n, jax.vmap(dot)(n, b.x) + b.shape.offset, 2.0 * e
+        each = jax.vmap(jax.vmap(mixed, (None, 0)), (0, None))
+        e, *falloff = map(each, own, others)
+        return n, jax.vmap(dot)(n, b.x) + b.shape.offset, (2.0 * e, *falloff)
 
-    def one(body: tuple, plane: tuple, twice_e: Array) -> Array:
+    def one(body: tuple, plane: tuple, twice_e: tuple) -> Array:
         (x, v, acc, t0, since, radius), (n, offset) = body, plane
         acc = dot(n, acc)
         s, _, found, u, sunk = meet_on_parabola(dot(n, x) - offset - radius, dot(n, v), acc, None)
         s = jnp.where(sunk | (t0 + s < since), t0, t0 + s)
-        rests = (u <= world.contact.rest_speed) | (twice_e * u <= -acc * (dt - s))
+        rests = (u <= world.contact.rest_speed) | (restitution_at(u, *twice_e) * u <= -acc * (dt - s))
         return jnp.where(found, jnp.where(rests & (s <= dt), RESTS, s), jnp.inf)
 
     n, offset, twice_e = apart(live, planes, b, own, others)

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
+from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.isolated import is_crowded, next_impacts, tables_of
 from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.resting import Strikes, solve_impulses
@@ -120,9 +121,11 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     impact, push = phase == IMPACT, phase == PUSH
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
-    restitution, friction = coefficients(world, dt.shape)
+    restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
     drives = _rows_of(driven(world), dt[None])
     u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
+    if world.bodies.restitution_falloff is not None:
+        restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
     slow = u <= world.contact.rest_speed[None]
     hang_together = islands(world.joints, len(world.names))
     now = strikes.active & _is_next(strikes, strikes.active & ~slow, hang_together, dt)
