@@ -8,7 +8,8 @@ BODY.mass | inertia | restitution | friction | ... | shape.FIELD
 BODY.x | v | q | w | angle               initial state (angle: 2D)
 STATIC.x | q | angle | restitution | friction | ... | shape.FIELD
 
-The dots stand for the coefficients that only some worlds have: restitution_falloff.
+The dots stand for the coefficients that only some worlds have: restitution_falloff, rolling_friction,
+spinning_friction.
 """
 
 from typing import Any, NamedTuple
@@ -29,7 +30,7 @@ UNITS = {
     "radius": "m", "half": "m", "half_length": "m", "vertices": "m", "offset": "m", "width": "m",
     "linear": "N s/m", "angular": "N m s", "stiffness": "N/m", "damping": "N s/m", "length": "m",
     "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
-    "restitution_falloff": "s/m",
+    "restitution_falloff": "s/m", "rolling_friction": "m", "spinning_friction": "m",
 }  # fmt: skip
 
 

@@ -49,7 +49,7 @@ class Body:
             (3, 3) matrix in 3D. Default: that of the shape, uniform.
         x: [m] centre of mass. v: [m/s]. w: [rad/s], world frame, a number in 2D.
         angle: [rad] (2D), or q: (cos, sin) in 2D, unit quaternion (w, x, y, z) in 3D. Default: unturned.
-        restitution, friction, restitution_falloff: default: those of the scene.
+        restitution, friction and the other coefficients: default: those of the scene.
     """
 
     shape: Shape | None
@@ -64,6 +64,8 @@ class Body:
     restitution: Any = None
     friction: Any = None
     restitution_falloff: Any = None
+    rolling_friction: Any = None
+    spinning_friction: Any = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,8 @@ class Static:
     restitution: Any = None
     friction: Any = None
     restitution_falloff: Any = None
+    rolling_friction: Any = None
+    spinning_friction: Any = None
 
 
 def scene(
@@ -86,6 +90,8 @@ def scene(
     restitution: Any = 0.0,
     friction: Any = 0.0,
     restitution_falloff: Any = None,
+    rolling_friction: Any = None,
+    spinning_friction: Any = None,
     contact: Contact | None = None,
     forces: Sequence | Mapping = (),
     joints: Sequence | Mapping = (),
@@ -98,6 +104,8 @@ def scene(
         restitution, friction: [-] of every body and static that does not set its own. A contact takes the
             mean of its two sides, or the one that was set if only one was.
         restitution_falloff: [s/m] of c in e = restitution (1 + c u)^(-1/4), u the speed of the impact; None: constant.
+        rolling_friction, spinning_friction: [m] the most torque per normal force, against rolling and, in 3D, against
+            spinning about the normal; None: none. Mixed as restitution is.
         contact: the contact model; default `Contact()`, exact impacts.
         forces: records from `diffrigid.forces`, in a sequence or by name; a name is what a path to it starts
             with, by default the class in lower case. They name bodies as `bodies` does.
@@ -122,8 +130,10 @@ def scene(
     records, offsets, owners = _stack_shapes(shapes, solids, dim)
     kinds = [type(record) for record in records]
     pairs = pair_groups(kinds, owners, n, passing, COLLIDERS, lambda i, j: _count(records[i], records[j], dim))
-    general = {"restitution": restitution, "friction": friction, "restitution_falloff": restitution_falloff}
-    material = materials(everything, general)
+    numbers_of_all = restitution, friction, restitution_falloff, rolling_friction, spinning_friction
+    material = materials(everything, dict(zip(COEFFICIENTS, numbers_of_all, strict=True)))
+    if dim == 2 and "spinning_friction" in material:
+        raise ValueError("spinning_friction: in 2D nothing turns about a normal; give rolling_friction.")
     of_bodies, of_statics = ({k: c[part] for k, (c, _) in material.items()} for part in (slice(n), slice(n, None)))
     mass, inertia = zip(*(mass_and_inertia(k, b, solids[k], dim) for k, b in moving.items()), strict=True)
     made = World(

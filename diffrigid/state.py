@@ -11,7 +11,13 @@ from jax import Array
 from diffrigid import so2, so3
 from diffrigid.pytree import array, pytree, static
 
-COEFFICIENTS = ("restitution", "friction", "restitution_falloff")  # of colliders; all but two may be None
+COEFFICIENTS = (  # of colliders; all but the first two may be None
+    "restitution",
+    "friction",
+    "restitution_falloff",
+    "rolling_friction",
+    "spinning_friction",
+)
 
 
 def rotations(dim: int) -> ModuleType:
@@ -38,6 +44,8 @@ class Bodies:
     restitution: Array = array("N")  # (N, *batch) [-]
     friction: Array = array("N")  # (N, *batch) [-]
     restitution_falloff: Array | None = array("N", default=None)  # (N, *batch) [s/m]; None: constant restitution
+    rolling_friction: Array | None = array("N", default=None)  # (N, *batch) [m]; None: none
+    spinning_friction: Array | None = array("N", default=None)  # (N, *batch) [m]
     dim: int = static()
 
 

@@ -135,6 +135,14 @@ def _stopping_impulse(k: list, slip: list) -> list:
     return [-safe_divide(P, det) for P in (ns_ * s + nt_ * t, ss_ * s + st_ * t, st_ * s + tt_ * t)]
 
 
+def sticking_impulse(K: Array, n: Array, slip: Array) -> Array:
+    """The impulse (D, *batch) [N s] that stops a slip (D, *batch) [m/s] and leaves the normal velocity."""
+    basis, axes = _contact_frame(n), range(n.shape[0])
+    k = [[dot(basis[i], times(K, basis[j])) for j in axes] for i in axes]
+    P = _stopping_impulse(k, [dot(e, slip) for e in basis[1:]])
+    return sum(P[i][None] * basis[i] for i in axes)
+
+
 def _within_energy(T0: Array, b: Array, c: Array) -> Array:
     """Largest kappa <= 1 for which the kinetic energy does not rise: T0 + b kappa + c kappa^2 / 2 <= 0."""
     gains = (T0 + b + 0.5 * c > 0) & (c > 0)

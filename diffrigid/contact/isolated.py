@@ -20,7 +20,7 @@ from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
 from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.sides import Side
 from diffrigid.contact.slots import Slots, Table, fold, sides_of_table, summed
-from diffrigid.contact.strikes import materials, mixed, relative_path_is_straight
+from diffrigid.contact.strikes import is_rolling, materials, mixed, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
 from diffrigid.numerics import apart, constant, dot, safe_sqrt
@@ -42,7 +42,7 @@ def is_crowded(world: Any) -> bool:
         return closed_form(world.shapes[pairs.shape_a], world.shapes[pairs.shape_b], straight)
 
     one_disc_each = len({kind for kind, _ in bodies}) == 1 and sorted(o for _, o in bodies) == list(range(moving))
-    quiet = is_constant(world.forces) and not world.joints
+    quiet = is_constant(world.forces) and not world.joints and not is_rolling(world)
     return count > CROWDED * moving and quiet and one_disc_each and all(map(solved, world.pairs))
 
 

@@ -181,6 +181,12 @@ def coefficients(world: Any, name: str, batch: tuple[int, ...]) -> Array:
     return jnp.concatenate(whole) if len(parts) > 1 else parts[0]
 
 
+def is_rolling(world: Any) -> bool:
+    """Whether there is friction against rolling or spinning. Static."""
+    bodies = world.bodies
+    return bool(world.pairs) and not (bodies.rolling_friction is None and bodies.spinning_friction is None)
+
+
 def driven(world: Any) -> tuple[bool, ...]:
     """Of all contacts and rows: friction or a motor of a joint, which acts to both sides, in every step."""
     return (False,) * contact_count(world) + is_drive(world)
