@@ -86,11 +86,30 @@ def fraction(where: str, value: Any) -> Numbers:
 
 
 def coefficient(where: str, value: Any) -> Numbers:
-    """A coefficient of friction."""
+    """A coefficient of friction, or the fall-off of restitution."""
     array = numbers(where, value, ())
     if not traced(array) and not array >= 0:
         raise ValueError(f"{where} is {float(array):g}: expected 0 or above; give it without sign.")
     return array
+
+
+def materials(colliders: Mapping[str, Any], general: Mapping[str, Any]) -> dict[str, tuple[Any, tuple[bool, ...]]]:
+    """Of each coefficient the values of all colliders, and whether each was given to it.
+
+    Args:
+        general: values for those colliders that have none of their own; None: 0, and if none of the colliders has one
+            either, there is no such coefficient.
+    """
+    found = {}
+    for field, default in general.items():
+        check = fraction if field == "restitution" else coefficient
+        own = {name: getattr(body, field) for name, body in colliders.items()}
+        given = tuple(value is not None for value in own.values())
+        if default is not None or any(given):
+            rest = check(field, 0.0 if default is None else default)
+            values = [rest if value is None else check(f"{name}.{field}", value) for name, value in own.items()]
+            found[field] = stack(values), given
+    return found
 
 
 def orientation(name: str, body: Any, dim: int) -> Numbers:

@@ -1,12 +1,15 @@
 """Names of parameters: a path such as "ball.mass" and the leaf, or the part of one, that it stands for.
 
-restitution, friction, gravity           all bodies and statics; the gravity vector
+restitution, friction, ..., gravity      a coefficient of all bodies and statics; the gravity vector
 contact.width, contact.rest_speed        numbers of the contact model
 FORCE.field                              a force of the scene, by its name: "drag.linear"
 JOINT.field                              a joint of the scene, by its name: "revolute.anchor_a"
-BODY.mass | inertia | restitution | friction | shape.FIELD
+BODY.mass | inertia | restitution | friction | ... | shape.FIELD
 BODY.x | v | q | w | angle               initial state (angle: 2D)
-STATIC.x | q | angle | restitution | friction | shape.FIELD
+STATIC.x | q | angle | restitution | friction | ... | shape.FIELD
+
+The dots stand for the coefficients that only some worlds have: restitution_falloff, rolling_friction,
+spinning_friction.
 """
 
 from typing import Any, NamedTuple
@@ -18,7 +21,7 @@ from diffrigid import so2
 from diffrigid.convert import nearest
 from diffrigid.forces import Gravity
 from diffrigid.pytree import array_fields, letters_of, replace
-from diffrigid.state import State
+from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
 
 UNITS = {
@@ -27,6 +30,7 @@ UNITS = {
     "radius": "m", "half": "m", "half_length": "m", "vertices": "m", "offset": "m", "width": "m",
     "linear": "N s/m", "angular": "N m s", "stiffness": "N/m", "damping": "N s/m", "length": "m",
     "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
+    "restitution_falloff": "s/m", "rolling_friction": "m", "spinning_friction": "m",
 }  # fmt: skip
 
 
@@ -45,7 +49,7 @@ def read(world: World, state: State, path: str) -> Array:
     for key in place.chain:
         leaf = leaf[key] if isinstance(key, int) else getattr(leaf, key)
     value: Any = leaf if place.row is None else leaf[place.row]
-    if path in ("restitution", "friction"):
+    if path in COEFFICIENTS:
         return value[0]
     return so2.log(value)[0] if place.angle else value
 
@@ -54,8 +58,8 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
     """World and state with a parameter changed; everything else shared. Works on traced values.
 
     Raises:
-        ValueError: there is no such parameter, or the value has another shape. "restitution" and "friction"
-            take a number for all.
+        ValueError: there is no such parameter, or the value has another shape. Coefficients without the name of a
+            body take a number for all.
     """
     pair: Any = (world, state)
     for place in places(world, path):
@@ -83,7 +87,8 @@ def places(world: World, path: str) -> list[Place]:
 def _catalogue(world: World) -> dict[str, list[Place]]:
     """Every path of a world."""
     out: dict[str, list[Place]] = {}
-    for name in ("restitution", "friction"):
+    coefficients = tuple(name for name in COEFFICIENTS if getattr(world.bodies, name) is not None)
+    for name in coefficients:
         out[name] = [Place((0, "bodies", name), None)]
         if world.static_names:
             out[name].append(Place((0, "statics", name), None))
@@ -100,12 +105,12 @@ def _catalogue(world: World) -> dict[str, list[Place]]:
                     out[f"{name}.{field}"] = [Place((0, "joints", group, field), row)]
     out |= {f"contact.{field}": [Place((0, "contact", field), None)] for field in array_fields(world.contact)}
     for row, name in enumerate(world.names):
-        out |= {f"{name}.{f}": [Place((0, "bodies", f), row)] for f in ("mass", "inertia", "restitution", "friction")}
+        out |= {f"{name}.{f}": [Place((0, "bodies", f), row)] for f in ("mass", "inertia", *coefficients)}
         out |= {f"{name}.{f}": [Place((1, f), row)] for f in ("x", "q", "v", "w")}
         if world.dim == 2:
             out[f"{name}.angle"] = [Place((1, "q"), row, angle=True)]
     for row, name in enumerate(world.static_names):
-        out |= {f"{name}.{f}": [Place((0, "statics", f), row)] for f in ("x", "q", "restitution", "friction")}
+        out |= {f"{name}.{f}": [Place((0, "statics", f), row)] for f in ("x", "q", *coefficients)}
         if world.dim == 2:
             out[f"{name}.angle"] = [Place((0, "statics", "q"), row, angle=True)]
     names = world.names + world.static_names
@@ -131,7 +136,7 @@ def _set(record: Any, field: str, place: Place, path: str, value: Any) -> Array:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path} is {value!r}: expected numbers.") from error
     expected, batch = _axes(record, field, place)
-    if place.row is None and path in ("restitution", "friction") and value.ndim == 0:
+    if place.row is None and path in COEFFICIENTS and value.ndim == 0:
         return jnp.broadcast_to(value, leaf.shape)
     if value.ndim == 0 and expected == (1,):
         value = value[None]

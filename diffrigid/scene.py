@@ -15,10 +15,9 @@ from diffrigid.convert import (
     Solid,
     angular_velocity,
     by_name,
-    coefficient,
     force_of,
-    fraction,
     mass_and_inertia,
+    materials,
     nearest,
     numbers,
     orientation,
@@ -32,11 +31,11 @@ from diffrigid.overlap import overlapping, place
 from diffrigid.pytree import map_arrays
 from diffrigid.shape_checks import check_shape
 from diffrigid.shapes import HalfSpace, Hull, Polygon, Shape, dimension, traced
-from diffrigid.state import Bodies, State
+from diffrigid.state import COEFFICIENTS, Bodies, State
 from diffrigid.world import Offset, Statics, World
 
 OVERLAP = 1e-4  # [-] of the smaller size: penetration at the start that is worth a warning
-RESERVED = ("restitution", "friction", "contact")  # paths, or the first part of one; and "gravity"
+RESERVED = (*COEFFICIENTS, "contact")  # paths, or the first part of one; and "gravity"
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Body:
             (3, 3) matrix in 3D. Default: that of the shape, uniform.
         x: [m] centre of mass. v: [m/s]. w: [rad/s], world frame, a number in 2D.
         angle: [rad] (2D), or q: (cos, sin) in 2D, unit quaternion (w, x, y, z) in 3D. Default: unturned.
-        restitution, friction: default: those of the scene.
+        restitution, friction and the other coefficients: default: those of the scene.
     """
 
     shape: Shape | None
@@ -64,6 +63,9 @@ class Body:
     w: Any = None
     restitution: Any = None
     friction: Any = None
+    restitution_falloff: Any = None
+    rolling_friction: Any = None
+    spinning_friction: Any = None
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,9 @@ class Static:
     q: Any = None
     restitution: Any = None
     friction: Any = None
+    restitution_falloff: Any = None
+    rolling_friction: Any = None
+    spinning_friction: Any = None
 
 
 def scene(
@@ -84,6 +89,9 @@ def scene(
     gravity: Any = None,
     restitution: Any = 0.0,
     friction: Any = 0.0,
+    restitution_falloff: Any = None,
+    rolling_friction: Any = None,
+    spinning_friction: Any = None,
     contact: Contact | None = None,
     forces: Sequence | Mapping = (),
     joints: Sequence | Mapping = (),
@@ -95,6 +103,9 @@ def scene(
         gravity: (D,) [m/s^2]; None: none.
         restitution, friction: [-] of every body and static that does not set its own. A contact takes the
             mean of its two sides, or the one that was set if only one was.
+        restitution_falloff: [s/m] of c in e = restitution (1 + c u)^(-1/4), u the speed of the impact; None: constant.
+        rolling_friction, spinning_friction: [m] the most torque per normal force, against rolling and, in 3D, against
+            spinning about the normal; None: none. Mixed as restitution is.
         contact: the contact model; default `Contact()`, exact impacts.
         forces: records from `diffrigid.forces`, in a sequence or by name; a name is what a path to it starts
             with, by default the class in lower case. They name bodies as `bodies` does.
@@ -119,17 +130,20 @@ def scene(
     records, offsets, owners = _stack_shapes(shapes, solids, dim)
     kinds = [type(record) for record in records]
     pairs = pair_groups(kinds, owners, n, passing, COLLIDERS, lambda i, j: _count(records[i], records[j], dim))
-    e, own_e = _material("restitution", everything, restitution)
-    mu, own_mu = _material("friction", everything, friction)
+    numbers_of_all = restitution, friction, restitution_falloff, rolling_friction, spinning_friction
+    material = materials(everything, dict(zip(COEFFICIENTS, numbers_of_all, strict=True)))
+    if dim == 2 and "spinning_friction" in material:
+        raise ValueError("spinning_friction: in 2D nothing turns about a normal; give rolling_friction.")
+    of_bodies, of_statics = ({k: c[part] for k, (c, _) in material.items()} for part in (slice(n), slice(n, None)))
     mass, inertia = zip(*(mass_and_inertia(k, b, solids[k], dim) for k, b in moving.items()), strict=True)
     made = World(
-        bodies=Bodies(mass=stack(mass), inertia=stack(inertia), restitution=e[:n], friction=mu[:n], dim=dim),
-        statics=Statics(**_poses(still, dim), restitution=e[n:], friction=mu[n:]),
+        bodies=Bodies(mass=stack(mass), inertia=stack(inertia), dim=dim, **of_bodies),
+        statics=Statics(**_poses(still, dim), **of_statics),
         shapes=records, offsets=offsets, owners=owners, pairs=pairs,
         forces=tuple(named_forces.values()), force_names=tuple(named_forces),
         joints=linked, joint_names=joint_names,
         contact=_contact(Contact() if contact is None else contact),
-        names=tuple(moving), static_names=tuple(still), own_restitution=own_e, own_friction=own_mu,
+        names=tuple(moving), static_names=tuple(still), **{f"own_{k}": own for k, (_, own) in material.items()},
     )  # fmt: skip
     start = _state(moving, dim)
     _warn_of_overlap(made, start, shapes, solids)
@@ -208,15 +222,6 @@ def _state(moving: Mapping[str, Body], dim: int) -> State:
     v = [numbers(f"{k}.v", np.zeros(dim) if b.v is None else b.v, (dim,)) for k, b in moving.items()]
     w = [angular_velocity(k, b.w, dim) for k, b in moving.items()]
     return State(**_poses(moving, dim), v=stack(v), w=stack(w))
-
-
-def _material(field: str, everything: Mapping, default: Any) -> tuple[Any, tuple[bool, ...]]:
-    """Values of all colliders, (N + S,), and whether each was given to it."""
-    check = fraction if field == "restitution" else coefficient
-    general = check(field, default)
-    own = {name: getattr(body, field) for name, body in everything.items()}
-    values = [general if value is None else check(f"{name}.{field}", value) for name, value in own.items()]
-    return stack(values), tuple(value is not None for value in own.values())
 
 
 def _stack_shapes(shapes: Mapping[str, Any], solids: Mapping[str, Solid | None], dim: int):

@@ -37,11 +37,11 @@ from diffrigid import forces, joints, shapes, sysid
 from diffrigid.contact import Contact
 from diffrigid.convert import nearest
 from diffrigid.scene import Body, Static, scene
-from diffrigid.state import State
+from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
 
 TABLES = ("bodies", "statics", "forces", "joints", "free", "observe", "fit")
-ARGUMENTS = ("gravity", "restitution", "friction", "ignore", "contact")
+ARGUMENTS = ("gravity", *COEFFICIENTS, "ignore", "contact")
 OPTIONS = ("starts", "dt", "noise", "widths", "windows", "iterations", "seed")
 KINDS: dict[str, Callable] = {
     name: getattr(sysid, name)

@@ -11,6 +11,14 @@ from jax import Array
 from diffrigid import so2, so3
 from diffrigid.pytree import array, pytree, static
 
+COEFFICIENTS = (  # of colliders; all but the first two may be None
+    "restitution",
+    "friction",
+    "restitution_falloff",
+    "rolling_friction",
+    "spinning_friction",
+)
+
 
 def rotations(dim: int) -> ModuleType:
     """The module that knows rotations in `dim` dimensions: so2 or so3."""
@@ -35,6 +43,9 @@ class Bodies:
     inertia: Array = array(lambda b: ("N",) if b.dim == 2 else ("N", "D", "D"))  # [kg m^2]
     restitution: Array = array("N")  # (N, *batch) [-]
     friction: Array = array("N")  # (N, *batch) [-]
+    restitution_falloff: Array | None = array("N", default=None)  # (N, *batch) [s/m]; None: constant restitution
+    rolling_friction: Array | None = array("N", default=None)  # (N, *batch) [m]; None: none
+    spinning_friction: Array | None = array("N", default=None)  # (N, *batch) [m]
     dim: int = static()
 
 

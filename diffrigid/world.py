@@ -19,6 +19,9 @@ class Statics:
     q: Array = array("S", "Q")  # (S, Q, *batch)
     restitution: Array = array("S")  # (S, *batch) [-]
     friction: Array = array("S")  # (S, *batch) [-]
+    restitution_falloff: Array | None = array("S", default=None)  # (S, *batch) [s/m]
+    rolling_friction: Array | None = array("S", default=None)  # (S, *batch) [m]
+    spinning_friction: Array | None = array("S", default=None)  # (S, *batch) [m]
 
 
 @pytree
@@ -45,6 +48,9 @@ class World:
     pairs: tuple[PairGroup, ...] = static()
     own_restitution: tuple[bool, ...] = static()  # of each collider: given to it, not the scene's default
     own_friction: tuple[bool, ...] = static()
+    own_restitution_falloff: tuple[bool, ...] = static(default=())
+    own_rolling_friction: tuple[bool, ...] = static(default=())
+    own_spinning_friction: tuple[bool, ...] = static(default=())
 
     @property
     def dim(self) -> int:

@@ -24,7 +24,7 @@ def crowd(angle):
         bodies[f"d{k}"] = dr.Body(dr.Disc(radius=radius), x=0.6 * at, v=-1.5 * at + rng.normal(size=2), **own)
     for k, n in enumerate([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]):
         bodies[f"wall{k}"] = dr.Static(dr.HalfSpace(normal=n, offset=-1.0))
-    return dr.scene(bodies, gravity=(0.3, -9.81), restitution=0.9, friction=0.3)
+    return dr.scene(bodies, gravity=(0.3, -9.81), restitution=0.9, friction=0.3, restitution_falloff=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import diffrigid as dr
 from diffrigid import paths, so2
+from diffrigid.state import COEFFICIENTS
 
 FLAT = dr.scene(
     {
@@ -28,7 +29,7 @@ FLAT = dr.scene(
 )
 SOLID = dr.scene(
     {
-        "die": dr.Body(dr.Box(half=(0.1, 0.1, 0.1)), mass=0.02, x=(0, 0, 1)),
+        "die": dr.Body(dr.Box(half=(0.1, 0.1, 0.1)), mass=0.02, x=(0, 0, 1), restitution_falloff=0.2),
         "rod": dr.Body(dr.Capsule(radius=0.1, half_length=0.4), density=500, x=(1, 0, 1), w=(0, 0, 2)),
         "point": dr.Body(None, mass=1.0, inertia=(1, 1, 1), x=(9, 0, 0)),
         "ground": dr.Static(dr.HalfSpace(normal=(0, 0, 1))),
@@ -51,6 +52,7 @@ def test_every_leaf_has_a_path():
     expected |= {"air.linear", "air.angular", "push.F", "motor.tau", "contact.width", "contact.rest_speed"}
     expected |= {f"rope.{field}" for field in ("anchor_a", "anchor_b", "stiffness", "damping", "length")}
     assert set(paths._catalogue(FLAT[0])) == expected
+    assert {"restitution_falloff", "ground.restitution_falloff"} < set(paths._catalogue(SOLID[0]))
     assert {"die.inertia", "rod.shape.half_length", "drag.linear", "drag1.angular"} < set(paths._catalogue(SOLID[0]))
 
 
@@ -73,7 +75,7 @@ def test_round_trip(scene, path):
     changed = paths.write(world, state, path, new)
     assert_allclose(paths.read(*changed, path), new, rtol=1e-15)
     moved = changed_rows(scene, changed)
-    assert len(moved) == (2 if path in ("restitution", "friction") else 1)  # those are of bodies and statics
+    assert len(moved) == (2 if path in COEFFICIENTS else 1)  # those are of bodies and statics
     if path.split(".")[0] in world.names + world.static_names:
         assert [len(rows) for rows in moved.values()] == [1]  # no other body
 

@@ -53,6 +53,8 @@ MISTAKES = {
     "own restitution": (r"ball\.restitution is -0\.1: expected 0", {"ball": ball(restitution=-0.1)}, {}),
     "friction": (r"friction is -0\.3: expected 0 or above; give it without sign", {"ball": ball()}, {"friction": -0.3}),
     "own friction": (r"ball\.friction is -1: expected 0 or above", {"ball": ball(friction=-1.0)}, {}),
+    "falloff": (r"falloff is -1: expected 0 or above", {"ball": ball()}, {"restitution_falloff": -1.0}),
+    "own falloff": (r"ball\.restitution_falloff is -1: expected 0", {"ball": ball(restitution_falloff=-1.0)}, {}),
     "polygon clockwise": (
         r"ball\.shape\.vertices goes clockwise: reverse the order",
         {"ball": ball(dr.Polygon(vertices=SQUARE[::-1]))},

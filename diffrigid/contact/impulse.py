@@ -31,6 +31,18 @@ JAMMED = (
 )
 
 
+def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -> Array:
+    """Coefficient of restitution of an impact with closing speed u [m/s], e = restitution (1 + falloff u)^(-1/4).
+
+    The power is that of impacts in which the material yields, whatever the solid: e ~ u^(-1/4). Slow ones have the
+    whole restitution. Without falloff [s/m], or with 0, it is constant. All (*batch); smooth.
+    Source: Johnson, Contact Mechanics (1985), 11.5.
+    """
+    if falloff is None:
+        return restitution
+    return restitution / jnp.sqrt(jnp.sqrt(1.0 + falloff * jnp.where(u > 0, u, 0.0)))
+
+
 def effective_matrix(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
     """K, (D, D, *batch) [1/kg]: change of the relative velocity for a unit impulse at these arms (D, *batch) [m]."""
     K: Any = 0.0
@@ -121,6 +133,14 @@ def _stopping_impulse(k: list, slip: list) -> list:
     det = nn * (ss * tt - st * st) + ns * ns_ + nt * nt_
     s, t = slip
     return [-safe_divide(P, det) for P in (ns_ * s + nt_ * t, ss_ * s + st_ * t, st_ * s + tt_ * t)]
+
+
+def sticking_impulse(K: Array, n: Array, slip: Array) -> Array:
+    """The impulse (D, *batch) [N s] that stops a slip (D, *batch) [m/s] and leaves the normal velocity."""
+    basis, axes = _contact_frame(n), range(n.shape[0])
+    k = [[dot(basis[i], times(K, basis[j])) for j in axes] for i in axes]
+    P = _stopping_impulse(k, [dot(e, slip) for e in basis[1:]])
+    return sum(P[i][None] * basis[i] for i in axes)
 
 
 def _within_energy(T0: Array, b: Array, c: Array) -> Array:

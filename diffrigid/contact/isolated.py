@@ -18,9 +18,10 @@ from jax import Array, lax
 from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
+from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.sides import Side
 from diffrigid.contact.slots import Slots, Table, fold, meet, sides_of_table, sum_of_terms, summed
-from diffrigid.contact.strikes import Material, material, mixed, relative_path_is_straight
+from diffrigid.contact.strikes import is_rolling, materials, mixed, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
 from diffrigid.numerics import apart, constant, dot
@@ -43,7 +44,7 @@ def is_crowded(world: Any) -> bool:
         return closed_form(world.shapes[pairs.shape_a], world.shapes[pairs.shape_b], straight)
 
     one_disc_each = len({kind for kind, _ in bodies}) == 1 and sorted(o for _, o in bodies) == list(range(moving))
-    quiet = is_constant(world.forces) and not world.joints
+    quiet = is_constant(world.forces) and not world.joints and not is_rolling(world)
     return count > CROWDED * moving and quiet and one_disc_each and all(map(solved, world.pairs))
 
 
@@ -211,19 +212,22 @@ def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> 
 def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
     so, live, f = rotations(a.flight.dim), jnp.any(dt > 0), a.flight
     straight = relative_path_is_straight(world, both_move=False)
-    own, others = (material(world, "restitution", of) for of in (tuple(range(len(world.names))), table.b))
+    names = ("restitution", "restitution_falloff")
+    own, others = (materials(world, of, names) for of in (tuple(range(len(world.names))), table.b))
 
-    def planes(b: Side, own: Material, others: Material) -> tuple:
+    def planes(b: Side, own: list, others: list) -> tuple:
         n = jax.vmap(so.rotate)(b.q, b.shape.normal)
-        e = jax.vmap(jax.vmap(mixed, (None, 0)), (0, None))(own, others)
-        return n, jax.vmap(dot)(n, b.x) + b.shape.offset, 2.0 * e
+        each = jax.vmap(jax.vmap(mixed, (None, 0)), (0, None))
+        e, *falloff = map(each, own, others)
+        return n, jax.vmap(dot)(n, b.x) + b.shape.offset, (2.0 * e, *falloff)
 
-    def one(body: tuple, plane: tuple, twice_e: Array) -> Array:
+    def one(body: tuple, plane: tuple, twice_e: tuple) -> Array:
         (x, v, acc, t0, since, radius), (n, offset) = body, plane
         acc = None if straight else dot(n, acc)
         s, _, found, u, sunk = meet_on_parabola(dot(n, x) - offset - radius, dot(n, v), acc, None)
         s = jnp.where(sunk | (t0 + s < since), t0, t0 + s)
-        rests = (u <= world.contact.rest_speed) | (twice_e * u <= (0.0 if acc is None else -acc * (dt - s)))
+        back = restitution_at(u, *twice_e) * u
+        rests = (u <= world.contact.rest_speed) | (back <= (0.0 if acc is None else -acc * (dt - s)))
         return jnp.where(found, jnp.where(rests & (s <= dt), RESTS, s), jnp.inf)
 
     n, offset, twice_e = apart(live, planes, b, own, others)

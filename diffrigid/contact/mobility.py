@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from diffrigid.contact.cone import put
 from diffrigid.contact.sides import at_colliders, between_bodies, side_sum
 from diffrigid.linkage import Linkage, spread
 from diffrigid.numerics import dot, identity, inverse_matrix, rows, unit_vector
@@ -20,11 +21,14 @@ class Arms:
 
     The last R of them, those that `jac` is of, are rows along coordinates of joints: the first component of their
     velocities is the rate of a coordinate, that of their impulses acts along it, and they have no others.
+    With `spin`, the K rows behind the K contacts turn: their velocities are w_a - w_b, their impulses torques; in 2D
+    these are the first components.
     """
 
     arm_a: Array = array("C", "D")
     arm_b: Array = array("C", "D")
     jac: Any = array("R", "2", "D + A", default=None)  # of each coordinate by the twists of a and b
+    spin: Any = array("K", default=None)
     a: tuple[int, ...] = static()
     b: tuple[int, ...] = static()
 
@@ -45,10 +49,13 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
         arms: with the fields of `Arms`.
     """
     so = rotations(P.shape[1])
-    points, along = len(P) - _rows(arms), P[len(P) - _rows(arms) :, :1]
-    P = P[:points]
+    points, along = _points(arms), P[len(P) - _rows(arms) :, :1]
+    P, torque = P[:points], P[points : len(P) - _rows(arms), : so.A]
     on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a[:points], P)], axis=1)
     on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b[:points], -P)], axis=1)
+    if arms.spin is not None:
+        turn = jnp.concatenate([jnp.zeros_like(P), torque], axis=1)
+        on_a, on_b = jnp.concatenate([on_a, turn]), jnp.concatenate([on_b, -turn])
     if arms.jac is not None:
         on_a, on_b = (jnp.concatenate([on, along * arms.jac[:, side]]) for side, on in enumerate((on_a, on_b)))
     total = side_sum(on_a, on_b, arms.a, arms.b, moving)
@@ -73,18 +80,31 @@ def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
     def point_velocity(at, arm):
         return at[: so.D] + so.cross(at[so.D :], arm)
 
-    points = len(arms.a) - _rows(arms)
+    points, rows_from = _points(arms), len(arms.a) - _rows(arms)
     on_a, on_b = (
         jax.vmap(point_velocity)(at[:points], arm[:points]) for at, arm in ((at_a, arms.arm_a), (at_b, arms.arm_b))
     )
-    if arms.jac is None:
-        return on_a - on_b
-    rates = (arms.jac * jnp.stack([at_a[points:], at_b[points:]], axis=1)).sum((1, 2))
-    return jnp.concatenate([on_a - on_b, _first(rates, so.D)])
+    parts = [on_a - on_b]
+    if arms.spin is not None:
+        parts.append(_as_vectors(at_a[points:rows_from, so.D :] - at_b[points:rows_from, so.D :], so.D))
+    if arms.jac is not None:
+        rates = (arms.jac * jnp.stack([at_a[rows_from:], at_b[rows_from:]], axis=1)).sum((1, 2))
+        parts.append(_first(rates, so.D))
+    return jnp.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
 def _rows(arms: Any) -> int:
     return 0 if arms.jac is None else len(arms.jac)
+
+
+def _points(arms: Any) -> int:
+    """Contacts, without rows that turn and those of joints."""
+    return len(arms.a) - _rows(arms) if arms.spin is None else len(arms.spin)
+
+
+def _as_vectors(values: Array, D: int) -> Array:
+    """Angular velocities (K, A, *batch) as vectors (K, D, *batch)."""
+    return jnp.pad(values, [(0, 0), (0, D - values.shape[1]), *[(0, 0)] * (values.ndim - 2)])
 
 
 def _first(values: Array, D: int) -> Array:
@@ -115,6 +135,10 @@ def bodies_inverse(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     so = rotations(D)
     size = D + so.A
     J_a, J_b = (jax.vmap(lambda arm: _by_units(so, arm))(arm) for arm in (arms.arm_a, arms.arm_b))  # (C, size, D)
+    if arms.spin is not None:
+        turns = jnp.eye(size, dtype=arms.arm_a.dtype)[:, D:].reshape(1, size, so.A, *[1] * len(batch))
+        turns = jnp.broadcast_to(_as_vectors(turns[0], D), (len(arms.spin), size, D, *batch))
+        J_a, J_b = put(arms.spin, J_a, turns), put(arms.spin, J_b, turns)
     if arms.jac is not None:
         points, by_twist = len(arms.a) - len(arms.jac), jax.vmap(lambda jac: _first(jac, D))
         J_a = jnp.concatenate([J_a[:points], by_twist(arms.jac[:, 0])])

@@ -24,12 +24,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
+from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
 from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.resting import Strikes, solve_impulses
+from diffrigid.contact.rolling import rolling_stops, with_rows
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
-from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, may_meet
+from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, is_rolling, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.linkage import islands, linkage, spread
 from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide, with_tangents
@@ -114,9 +116,11 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     impact, push = phase == IMPACT, phase == PUSH
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
-    restitution, friction = coefficients(world, dt.shape)
+    restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
     drives = _rows_of(driven(world), dt[None])
     u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
+    if world.bodies.restitution_falloff is not None:
+        restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
     slow = u <= world.contact.rest_speed[None]
     hang_together = islands(world.joints, len(world.names))
     now = strikes.active & _is_next(strikes, strikes.active & ~slow, hang_together, dt)
@@ -211,9 +215,14 @@ def _apply(
     onto = _onto_joints(flight, t, mobility, (count > 0) & (kick > 0))
     if onto is not None:
         strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
-    P = solve_impulses(strikes, *law, mobility, own[:, 0], world.contact.rest_speed)
+    crowd, stopped = own[:, 0], stopping_early
+    if is_rolling(world):
+        strikes, law, held_for = with_rows(world, strikes, law, held_for, flight, t, mobility, kick)
+        acting = strikes.active.astype(kick.dtype)
+        crowd, stopped = side_sum(acting, acting, strikes.a, strikes.b, moving), functools.partial(rolling_stops, mobility)
+    P = solve_impulses(strikes, *law, mobility, crowd, world.contact.rest_speed)
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    early_P = stopping_early(strikes, P, law, held_for)
+    early_P = stopped(strikes, P, law, held_for)
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
     kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.contact.cone import Cone, nearest, split
+from diffrigid.contact.cone import Cone, nearest, put, split
 from diffrigid.contact.mobility import Mobility, at_contacts, bodies_inverse, twists
 from diffrigid.numerics import norm
 from diffrigid.state import rotations
@@ -44,6 +44,8 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
     def pushed(P: Array, y: Array) -> Array:
         _, y_t = split(cone.normal, y)
         opening = cone.mu * jax.vmap(norm)(y_t) - cone.target
+        if cone.spin is not None:
+            opening = put(cone.spin, opening, jnp.zeros_like(cone.spin))
         return nearest(cone, P - sigma * (y + opening[:, None] * cone.normal))
 
     def again(carry):

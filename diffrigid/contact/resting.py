@@ -31,6 +31,7 @@ class Strikes:
     a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
     b: tuple[int, ...] = static(default=())
     jac: Any = array("R", "2", "D + A", default=None)  # of the last R, which are rows of joints; see `Arms`
+    spin: Any = array("K", default=None)  # [m] of K rows behind the first K contacts, against turning; see `Cone`
 
 
 def solve_impulses(
@@ -55,7 +56,9 @@ def solve_impulses(
     scale = lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
     cone = Cone(
         on=shared.astype(others.dtype), crowd=jnp.maximum(others, 1.0), scale=scale, normal=strikes.normal,
-        target=target, mu=mu, most=most, rest_speed=rest_speed,
+        target=target, mu=mu, most=most, spin=strikes.spin, rest_speed=rest_speed,
     )  # fmt: skip
-    arms = Arms(arm_a=strikes.arm_a, arm_b=strikes.arm_b, jac=strikes.jac, a=strikes.a, b=strikes.b)
+    arms = Arms(
+        arm_a=strikes.arm_a, arm_b=strikes.arm_b, jac=strikes.jac, spin=strikes.spin, a=strikes.a, b=strikes.b
+    )  # fmt: skip
     return alone + solve_together(jnp.any(shared), cone, strikes.v_rel, arms, mobility)

@@ -1,9 +1,12 @@
 """Where resting contacts and friction displace bodies within a step, apart from what their even force does."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from diffrigid.contact.cone import put, turning
 from diffrigid.contact.mobility import momentum_changes
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import at_colliders, same_bodies
@@ -19,6 +22,8 @@ def keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array
     They move the angular momentum about the origin by P x (v_a - v_b): both bodies give back half of it.
     """
     jac = None if strikes.jac is None else jnp.zeros_like(strikes.jac)
+    if strikes.spin is not None:  # torques displace nothing
+        P = put(strikes.spin, P, jnp.zeros_like(turning(strikes.spin, P)))
     return momentum_changes(replace(strikes, arm_a=drift, arm_b=-drift, jac=jac), P, moving)[1]
 
 
@@ -36,11 +41,8 @@ def stopping_early(strikes: Strikes, P: Array, law: tuple[Array, Array, Array | 
     part of P that goes with the slip at the beginning, with its centroid at half the time tau until the stop instead
     of T / 2: so it moves the contact by a further (T - tau) / 2. Exact for one direction of slip under a constant pull.
     """
-    n, together, (target, mu, most) = strikes.normal, same_bodies(strikes.a, strikes.b), law
+    n, (target, mu, most) = strikes.normal, law
     of_joint = None if most is None else jnp.isfinite(most)  # it rubs along its coordinate
-
-    def in_all(values: Array) -> Array:  # over the contacts of the same two bodies, which slip as one
-        return rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), together).sum(1)
 
     def rubbing(r: Array) -> Array:
         r_t = r - jax.vmap(dot)(n, r)[:, None] * n
@@ -48,10 +50,24 @@ def stopping_early(strikes: Strikes, P: Array, law: tuple[Array, Array, Array | 
 
     at_end, friction = rubbing(strikes.v_rel - target[:, None] * n), rubbing(P)
     slip = at_end - T[:, None] * rubbing(strikes.pull)
-    speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
-    along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     bounds = mu * jax.vmap(dot)(n, P)
     bounds = bounds if most is None else jnp.where(jnp.isfinite(most), most, bounds)
+    return lost_to_stops(strikes, T, slip, at_end, friction, bounds)
+
+
+def lost_to_stops(strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array) -> Array:
+    """What impulses `friction` (C, D, *batch) within `bounds` (C, *batch) move too little; see `stopping_early`.
+
+    Args:
+        slip, at_end: (C, D, *batch) [m/s] at the beginning, and at the end without friction.
+    """
+    together = same_bodies(strikes.a, strikes.b)
+
+    def in_all(values: Array) -> Array:  # over the contacts of the same two bodies, which slip as one
+        return rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), together).sum(1)
+
+    speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
+    along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
     whole = jnp.where(speed > CREEP, at_end_speed * bound + size * (speed - along), 0.0)
     share = safe_divide(speed * size, whole)  # tau / T

@@ -17,7 +17,7 @@ from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
-from diffrigid.contact.strikes import MATERIALS, Material, material, mixed, strikes_of
+from diffrigid.contact.strikes import law, materials, strikes_of
 from diffrigid.flight import Flight, orientation
 from diffrigid.numerics import apart, dot, pack
 from diffrigid.pytree import replace
@@ -57,7 +57,7 @@ def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, 
     movers = [b for table, b in zip(tables, slots.b, strict=True) if table.b[0] < moving]
     weights = jnp.concatenate([slots.a, *movers])  # a of all slots, then b of all slots
     body, _ = sides_of_table(world, tables[0], flight, anchors.since)
-    columns, unpack = pack((body, _materials(world, tuple(range(moving)))), dt.ndim)
+    columns, unpack = pack((body, materials(world, tuple(range(moving)))), dt.ndim)
     columns = _pick(live, weights, columns)
     columns_a, columns_b = [c[:count] for c in columns], [c[count:] for c in columns]
 
@@ -65,7 +65,7 @@ def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, 
         (a, own), (b, others) = unpack(columns_a), unpack_b(columns_b)
         strike = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, b)
         strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, pull=None, drift=None))
-        return Blow(summed(there) * strike.active.astype(dt.dtype), strike, *map(mixed, own, others))
+        return Blow(summed(there) * strike.active.astype(dt.dtype), strike, *law(own, others, strike))
 
     def impulse(blows: list[Blow]) -> tuple:
         one, *others = blows
@@ -107,11 +107,7 @@ def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, 
 
 def _static(world: Any, table: Table, flight: Flight, since: Array) -> tuple:
     """The statics of a table, and their materials."""
-    return sides_of_table(world, table, flight, since)[1], _materials(world, table.b)
-
-
-def _materials(world: Any, colliders: tuple[int, ...]) -> list[Material]:
-    return [material(world, name, colliders) for name in MATERIALS]
+    return sides_of_table(world, table, flight, since)[1], materials(world, table.b)
 
 
 def sides_of_table(world: Any, table: Table, flight: Flight, since: Array) -> tuple[Side, Side]:

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.contact.impact import find_impact
-from diffrigid.contact.impulse import effective_matrix
+from diffrigid.contact.impulse import effective_matrix, restitution_at
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Placed, Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
 from diffrigid.contact.stops import find_stops, is_drive, of_stops, stop_ends, stops_of
@@ -136,9 +136,6 @@ def _acceleration(side: Side, at: Placed, s: Array, arm: Array) -> Array | None:
     return a + so.cross(so.apply(at.inverse_inertia, tau), arm)
 
 
-MATERIALS = ("restitution", "friction")
-
-
 @pytree
 class Material:
     """A coefficient of M colliders."""
@@ -148,7 +145,7 @@ class Material:
 
 
 def material(world: Any, name: str, colliders: tuple[int, ...]) -> Material:
-    """Restitution or friction (`name`) of colliders."""
+    """A coefficient, by its name, of colliders."""
     moving, still = getattr(world.bodies, name), getattr(world.statics, name)
     batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
     values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
@@ -157,18 +154,37 @@ def material(world: Any, name: str, colliders: tuple[int, ...]) -> Material:
     return Material(value=rows(values, colliders), given=lax.expand_dims(given, range(1, values.ndim)))
 
 
-def coefficients(world: Any, batch: tuple[int, ...]) -> tuple[Array, Array]:
-    """Restitution and friction of all contacts and rows, (C, *batch) [-] or what broadcasts."""
+LAW = ("restitution", "friction", "restitution_falloff")
+
+
+def materials(world: Any, colliders: tuple[int, ...], names: tuple[str, ...] = LAW) -> list[Material]:
+    """Those of some coefficients that the world has; all of them are what `law` takes."""
+    return [material(world, name, colliders) for name in names if getattr(world.bodies, name) is not None]
+
+
+def law(a: list[Material], b: list[Material], strike: Strikes) -> tuple[Array, Array]:
+    """Restitution and friction between two colliders, where they strike."""
+    e, mu, *falloff = map(mixed, a, b)
+    if falloff:
+        e = restitution_at(-jax.vmap(dot)(strike.normal, strike.v_rel), e, *falloff)
+    return e, mu
+
+
+def coefficients(world: Any, name: str, batch: tuple[int, ...]) -> Array:
+    """A coefficient, by its name, of all contacts and rows, (C, *batch) or what broadcasts."""
     index = {side: ends(world)[side][: contact_count(world)] for side in "ab"}
-    limits = ("lower", "upper")
-    both = []
-    for name in MATERIALS:
-        parts = [mixed(*(material(world, name, index[side]) for side in "ab"))] if world.pairs else []
-        if stops_of(world):
-            parts.append(of_stops(world, "restitution", limits if name == "restitution" else (), 0.0, batch))
-        whole = [jnp.broadcast_to(part, part.shape[:1] + batch) for part in parts]
-        both.append(jnp.concatenate(whole) if len(parts) > 1 else parts[0])
-    return both[0], both[1]
+    parts = [mixed(*(material(world, name, index[side]) for side in "ab"))] if world.pairs else []
+    if stops_of(world):
+        kinds = ("lower", "upper") if name == "restitution" else ()
+        parts.append(of_stops(world, "restitution", kinds, 0.0, batch))
+    whole = [jnp.broadcast_to(part, part.shape[:1] + batch) for part in parts]
+    return jnp.concatenate(whole) if len(parts) > 1 else parts[0]
+
+
+def is_rolling(world: Any) -> bool:
+    """Whether there is friction against rolling or spinning. Static."""
+    bodies = world.bodies
+    return bool(world.pairs) and not (bodies.rolling_friction is None and bodies.spinning_friction is None)
 
 
 def driven(world: Any) -> tuple[bool, ...]:

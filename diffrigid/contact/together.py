@@ -28,11 +28,11 @@ import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.contact.cone import Cone, allowed, split
+from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_inverse, twists
 from diffrigid.contact.multipliers import solve_roughly
 from diffrigid.numerics import FOUND, dot, norm, safe_divide
-from diffrigid.pytree import array, pytree
+from diffrigid.pytree import array, pytree, replace
 
 ROUNDS = 40  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start
@@ -52,6 +52,8 @@ class Slope:
     normal: Array = array("C", "D")
     along: Array = array("C", "D")  # of the sliding
     mu: Array = array("C")
+    free: Any = array("K", default=None)  # rows that turn: 1 where along the normal they are within their bounds
+    spin: Any = array("K", default=None)  # [m] else how that follows the load
 
 
 def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
@@ -68,16 +70,27 @@ def _moved(P: Array, arms: Arms, mobility: Mobility) -> Array:
 def _slope(cone: Cone, z: Array) -> Slope:
     z_n, z_t = split(cone.normal, z)
     size, bound = jax.vmap(norm)(z_t), cone.mu * jnp.maximum(z_n, 0.0)
+    bound = loaded(cone, jnp.maximum(z_n, 0.0), z_n, bound)[1]
     follows = z_n > 0 if cone.most is None else jnp.where(jnp.isinf(cone.most), z_n > 0, jnp.abs(z_n) < cone.most)
     on, slides = jnp.where(follows, cone.on, 0.0), (size >= bound).astype(z.dtype)
     turn, along = jnp.where(size < bound, 1.0, safe_divide(bound, size)), z_t / jnp.where(size > 0, size, 1.0)[:, None]
-    return Slope(on=on, slides=slides, turn=turn, normal=cone.normal, along=along, mu=cone.mu)
+    slope = Slope(on=on, slides=slides, turn=turn, normal=cone.normal, along=along, mu=cone.mu)
+    if cone.spin is None:
+        return slope
+    load, about = jnp.maximum(z_n[: len(cone.spin)], 0.0), turning(cone.spin, z_n)
+    free = (jnp.abs(about) < cone.spin * load).astype(z.dtype)
+    on = put(cone.spin, on, turning(cone.spin, cone.on))
+    return replace(slope, on=on, free=free, spin=(1.0 - free) * cone.spin * jnp.sign(about))
 
 
 def _sloped(slope: Slope, r: Array) -> Array:
     """D r, (C, D, *batch)."""
     r_n, r_t = split(slope.normal, r)
-    along = slope.slides * (slope.mu * r_n - slope.turn * jax.vmap(dot)(slope.along, r_t))
+    load = r_n
+    if slope.spin is not None:
+        load = put(slope.spin, r_n, (slope.on * r_n)[: len(slope.spin)])
+        r_n = put(slope.spin, r_n, slope.free * turning(slope.spin, r_n) + slope.spin * turning(slope.spin, load))
+    along = slope.slides * (slope.mu * load - slope.turn * jax.vmap(dot)(slope.along, r_t))
     return slope.on[:, None] * (r_n[:, None] * slope.normal + slope.turn[:, None] * r_t + along[:, None] * slope.along)
 
 
@@ -88,9 +101,28 @@ def _unsloped(slope: Slope, e: float, r: Array) -> tuple[Array, Array]:
     r_across = r_t - r_along[:, None] * slope.along
     on, kept = slope.on, 1.0 - slope.on * (1.0 - e)
     rest = 1.0 - on * (1.0 - e) * slope.turn  # e where it sticks
+    if slope.spin is not None:
+        kept = put(slope.spin, kept, 1.0 - turning(slope.spin, on) * slope.free * (1.0 - e))
+        return _unsloped_rows(slope, e, r_n / kept, r_along, r_across, rest)
     drag = slope.slides * slope.mu * r_n / kept * on
     B_r = (r_n / kept)[:, None] * slope.normal + r_across / rest[:, None]
     BD_r = (on * r_n / kept)[:, None] * slope.normal + (on * slope.turn / rest)[:, None] * r_across
+    return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
+
+
+def _unsloped_rows(slope: Slope, e: float, x_n: Array, r_along: Array, r_across: Array, rest: Array):
+    """The same where rows turn: what loads them is the first of the results, at their contacts.
+
+    Args:
+        x_n: normal components of B^-1 r but for what rows get from their load.
+    """
+    on, count = slope.on, len(slope.spin)
+    load = put(slope.spin, x_n, (on * x_n)[:count])
+    more = put(slope.spin, jnp.zeros_like(x_n), slope.spin * turning(slope.spin, on * load))
+    own = put(slope.spin, on, turning(slope.spin, on) * slope.free) * x_n
+    drag = on * slope.slides * slope.mu * load
+    B_r = (x_n + (1.0 - e) * more)[:, None] * slope.normal + r_across / rest[:, None]
+    BD_r = (own + more)[:, None] * slope.normal + (on * slope.turn / rest)[:, None] * r_across
     return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
 
 
@@ -101,7 +133,7 @@ def _small(dtype: Any) -> float:
 
 def _answer(slope: Slope, cone: Cone) -> Callable[[Array], Array]:
     """B^-1 D / k: impulses for relative velocities, (C, D, *batch)."""
-    return lambda y: _unsloped(slope, _small(y.dtype), y)[1] / cone.scale[:, None]
+    return lambda y: _unsloped(slope, _small(y.dtype), y / cone.scale[:, None])[1]
 
 
 def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:

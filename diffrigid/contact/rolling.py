@@ -1,0 +1,163 @@
+"""Friction against rolling and spinning: a row beside each contact, along which its two bodies turn.
+
+The torque on body a at a contact with the normal force N is at most rolling_friction N across the normal and, in
+space, spinning_friction N about it, and it stops the turning w_a - w_b if it can; likewise impulses in an impact. Rows
+follow their contacts in the list, one each, before those of joints. In the plane the torque is the first component.
+Source: the documentation of MuJoCo, whose coefficients of spinning and rolling friction are these lengths.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid.contact.cone import put, split, turning
+from diffrigid.contact.impulse import sticking_impulse
+from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
+from diffrigid.contact.resting import Strikes
+from diffrigid.contact.sides import at_colliders
+from diffrigid.contact.slipping import lost_to_stops, stopping_early
+from diffrigid.contact.strikes import coefficients, contact_count
+from diffrigid.flight import Flight, angular_momentum
+from diffrigid.numerics import dot, norm, unit_vector
+from diffrigid.pytree import replace
+from diffrigid.state import rotations
+
+STICKS = 1.0 - 1e-6  # of the bound of friction
+
+
+def with_rows(
+    world: Any, strikes: Strikes, law: tuple, T: Array, flight: Flight, t: Array, mobility: Mobility, kick: Array
+) -> tuple[Strikes, tuple, Array]:
+    """Strikes, law (target, mu, most) and times T of `solve_impulses` with the rows.
+
+    Args:
+        T: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
+        t: (N, *batch) [s] of each body, at which `mobility` is.
+        kick: 0 where gaps are pushed open, which turns nothing; else 1.
+    """
+    so, count, batch, flat = rotations(world.dim), contact_count(world), t.shape[1:], world.dim == 2
+    zero = jnp.zeros((count, *batch), t.dtype)
+    roll, spin = (kick * _of_contacts(world, f"{name}_friction", zero)[:count] for name in ("rolling", "spinning"))
+    roll, spin = (zero, roll) if flat else (roll, spin)
+    a, b = strikes.a[:count], strikes.b[:count]
+
+    def turns(values: Array) -> Array:  # of the bodies, (N, A, *batch), to a against b as vectors
+        change = at_colliders(values, a, 0.0) - at_colliders(values, b, 0.0)
+        return jnp.pad(change, [(0, 0), (0, so.D - so.A), *[(0, 0)] * len(batch)])
+
+    w = jax.vmap(so.apply)(mobility.inverse_inertia, jax.vmap(angular_momentum)(flight, t))
+    pull = jnp.zeros_like(w) if flight.tau is None else jax.vmap(so.apply)(mobility.inverse_inertia, flight.tau)
+    along = jax.vmap(lambda n: unit_vector(n, 0) if flat else n)(strikes.normal[:count])
+    none = jnp.zeros_like(along)
+    rows = Strikes(
+        active=strikes.active[:count], s=strikes.s[:count], gap=zero, normal=along, arm_a=none, arm_b=none,
+        K=_mobility_of_turns(mobility, a, b, so), v_rel=kick * turns(w), pull=turns(pull), drift=none,
+    )  # fmt: skip
+    strikes = replace(
+        jax.tree.map(lambda old, new: _behind(count, old, new), replace(strikes, a=(), b=(), jac=None), rows),
+        a=a + a + strikes.a[count:], b=b + b + strikes.b[count:], jac=strikes.jac, spin=spin,
+    )  # fmt: skip
+    target, mu, most = law
+    mu = jnp.broadcast_to(mu, target.shape)
+    most = None if most is None else _behind(count, most, jnp.full_like(zero, jnp.inf))
+    law = _behind(count, target, zero), _behind(count, mu, roll), most
+    return strikes, law, _behind(count, T, T[:count])
+
+
+def _of_contacts(world: Any, name: str, zero: Array) -> Array:
+    """A coefficient of all contacts, zero if the world does not have it."""
+    if getattr(world.bodies, name) is None:
+        return zero
+    return coefficients(world, name, zero.shape[1:])
+
+
+def _behind(count: int, values: Array, rows: Array) -> Array:
+    return jnp.concatenate([values[:count], rows, values[count:]])
+
+
+def _mobility_of_turns(mobility: Mobility, a: tuple[int, ...], b: tuple[int, ...], so: Any) -> Array:
+    """Change of w_a - w_b for torque impulses, (K, D, D, *batch) [1/(kg m^2)]."""
+    inverse = at_colliders(mobility.inverse_inertia, a, 0.0) + at_colliders(mobility.inverse_inertia, b, 0.0)
+    if so.D == 3:
+        return inverse
+    return jnp.pad(inverse[:, None, None], [(0, 0), (0, 1), (0, 1), *[(0, 0)] * (inverse.ndim - 1)])
+
+
+def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: tuple, T: Array) -> Array:
+    """`stopping_early`, and the same for rolling and spinning that stop, (C, D, *batch) [N s^2].
+
+    Where a contact sticks, the torque of its row brings an impulse with it that keeps the contact from slipping. Both
+    have the same centroid in time. Exact for one contact of two bodies.
+    """
+    spin, mu, torque = strikes.spin, law[1], turning(strikes.spin, P)
+    sticks = _sticks(strikes, P, mu)
+    pair = rows_of(strikes)
+    start = pair.v_rel - turning(spin, T)[:, None] * pair.pull
+    rest = P - _with_reaction(mobility, strikes, sticks, torque)
+    at_end = pair.v_rel + turning(spin, _changes(mobility, strikes, rest))
+    load = jax.vmap(dot)(strikes.normal, P)[: len(spin)]
+    lost = jnp.zeros_like(torque)
+    parts = [(_about, spin * load), (_across, turning(spin, mu) * load)]
+    for part, bound in parts[: P.shape[1] - 1]:  # in the plane nothing is across
+        slip, end, acting = (part(pair.normal, r) for r in (start, at_end, torque))
+        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound)
+    return _with_reaction(mobility, strikes, sticks, lost) + _of_slips(mobility, strikes, P, law, T)
+
+
+def rows_of(strikes: Strikes) -> Strikes:
+    """The rows that turn."""
+    spin, count = strikes.spin, len(strikes.spin)
+    rows = jax.tree.map(partial(turning, spin), replace(strikes, a=(), b=(), jac=None, spin=None))
+    return replace(rows, a=strikes.a[:count], b=strikes.b[:count])
+
+
+def _about(n: Array, r: Array) -> Array:
+    return split(n, r)[0][:, None] * n
+
+
+def _across(n: Array, r: Array) -> Array:
+    return split(n, r)[1]
+
+
+def _changes(mobility: Mobility, strikes: Strikes, P: Array) -> Array:
+    """Changes of the relative velocities by impulses, (C, D, *batch)."""
+    dv, dw, _ = velocities(mobility, *momentum_changes(strikes, P, mobility.inverse_mass.shape[0]))
+    return relative_changes(strikes, dv, dw)
+
+
+def _sticks(strikes: Strikes, P: Array, mu: Array) -> Array:
+    """1 for contacts that do not slip, (K, *batch)."""
+    P_n, P_t = (part[: len(strikes.spin)] for part in split(strikes.normal, P))
+    return (jax.vmap(norm)(P_t) < STICKS * mu[: len(P_n)] * P_n).astype(P.dtype)
+
+
+def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: Array) -> Array:
+    """Torques of the rows (K, D, *batch), and what keeps their contacts from slipping, (C, D, *batch) [N s]."""
+    so, count = rotations(torque.shape[1]), len(torque)
+
+    def moved(side: tuple[int, ...], arm: Array) -> Array:  # velocity of the contact point by the torque
+        inverse = at_colliders(mobility.inverse_inertia, side[:count], 0.0)
+        return jax.vmap(lambda inverse, tau, arm: so.cross(so.apply(inverse, tau[: so.A]), arm))(inverse, torque, arm)
+
+    slip = moved(strikes.a, strikes.arm_a[:count]) + moved(strikes.b, strikes.arm_b[:count])
+    P = jax.vmap(sticking_impulse)(strikes.K[:count], strikes.normal[:count], slip)
+    zero = jnp.zeros((len(strikes.a) - 2 * count, *P.shape[1:]), P.dtype)
+    return jnp.concatenate([sticks[:, None] * P, torque, zero])
+
+
+def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: tuple, T: Array) -> Array:
+    """`stopping_early` of contacts and rows of joints; to them the torques are a pull that acts evenly."""
+    spin, count = strikes.spin, len(strikes.spin)
+    by_torque = _changes(mobility, strikes, put(spin, jnp.zeros_like(P), turning(spin, P)))
+    pull = strikes.pull + by_torque / jnp.where(T > 0, T, 1.0)[:, None]
+
+    def others(values: Any) -> Any:
+        return jax.tree.map(lambda leaf: jnp.concatenate([leaf[:count], leaf[2 * count :]]), values)
+
+    free = replace(strikes, v_rel=strikes.v_rel + by_torque, pull=pull, a=(), b=(), jac=None, spin=None)
+    a, b = (side[:count] + side[2 * count :] for side in (strikes.a, strikes.b))
+    early = stopping_early(replace(others(free), a=a, b=b), others(P), others(law), others(T))
+    return jnp.concatenate([early[:count], jnp.zeros_like(turning(spin, P)), early[count:]])

@@ -1,0 +1,156 @@
+"""Friction against rolling and spinning, against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_form import vector
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+
+G, RADIUS, MASS = 9.81, 0.3, 1.3
+EXACT = 1e-9
+SHARE = {2: 0.5, 3: 0.4}  # I / (m r^2)
+
+
+def ball(dim, v=0.0, w=0.0, height=RADIUS, down=0.0):
+    """A disc or sphere that moves with v along the floor, turns forwards with w, and falls with `down`."""
+    up, ahead = np.eye(dim)[-1], np.eye(dim)[0]
+    shape = (dr.Disc if dim == 2 else dr.Sphere)(radius=RADIUS)
+    turn = -w if dim == 2 else vector(0.0, 1.0, 0.0) * w
+    return dr.Body(shape, mass=MASS, x=height * up, v=v * ahead - down * up, w=turn)
+
+
+def floor(dim):
+    return dr.Static(dr.HalfSpace(normal=np.eye(dim)[-1]))
+
+
+def at(t, scene, steps=60):
+    world, state = scene
+    times = jnp.stack([jnp.zeros_like(t), t])
+    states = dr.rollout(world, state, dt=1 / steps, times=times, substeps=(steps,)).state
+    return jax.tree.map(lambda leaf: leaf[-1, 0], states)
+
+
+def check_with_slopes(got, expected, cases, derivative):
+    """Two functions of the same numbers, and their slopes, for a batch of cases."""
+    cases = jnp.array(cases)
+    which = tuple(range(cases.shape[1]))
+
+    def both(fn):
+        return jax.jit(jax.vmap(lambda row: (fn(*row), derivative(fn, which)(*row))))(cases)
+
+    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), both(got), both(expected))
+
+
+def rolling(dim, mu, c, v, slope, t):
+    """Way of a ball on a plane that falls ahead by `slope`, which it does not leave."""
+    ahead, up = np.eye(dim)[0], np.eye(dim)[-1]
+    bodies = {"ball": ball(dim, v, jnp.where(mu > 0.4, v / RADIUS, 0.0)), "floor": floor(dim)}
+    gravity = G * (jnp.sin(slope) * ahead - jnp.cos(slope) * up)
+    return at(t, dr.scene(bodies, gravity=gravity, friction=mu, rolling_friction=c)).x[0]
+
+
+def rolls(dim, mu, c, v, slope, t):
+    """Rolling from the start, under the torque c m g cos(slope), which can only stop it."""
+    braking = G * (c / RADIUS * jnp.cos(slope) - jnp.sin(slope)) / (1 + SHARE[dim])
+    moves = jnp.minimum(t, v / braking) if v > 0 else t if braking < 0 else 0.0
+    return v * moves - 0.5 * braking * moves**2
+
+
+def slips_and_rolls(dim, mu, c, v, slope, t):
+    """From no turning: r w grows by (mu - c / r) g cos(slope) / (I / m r^2) until it is v."""
+    braking = G * (mu * jnp.cos(slope) - jnp.sin(slope))
+    slips = v / (braking + G * jnp.cos(slope) * (mu - c / RADIUS) / SHARE[dim])
+    way = v * slips - 0.5 * braking * slips**2
+    return way + rolls(dim, mu, c, v - braking * slips, slope, t - slips)
+
+
+CASES = {
+    "rolls on": (rolls, (0.5, 0.02, 1.0, 0.0, 1.0)),
+    "stops within a step": (rolls, (0.5, 0.1, 1.0, 0.0, 0.97)),
+    "slips at first": (slips_and_rolls, (0.3, 0.02, 3.0, 0.0, 1.0)),
+    "is held on a slope": (rolls, (0.5, 0.29 * RADIUS, 0.0, 0.28, 1.0)),
+    "rolls down a slope": (rolls, (0.5, 0.27 * RADIUS, 0.0, 0.28, 1.0)),
+}
+
+
+@pytest.mark.parametrize("dim, derivative", [(2, jax.jacrev), (3, jax.jacfwd)])
+def test_a_ball_on_a_plane(dim, derivative):
+    """A batch of cases, and slopes by both frictions, speed, slope and time."""
+    which = tuple(range(5))
+
+    def both(row):
+        return rolling(dim, *row), jnp.stack(derivative(lambda *row: rolling(dim, *row), which)(*row))
+
+    values, slopes = jax.jit(jax.vmap(both))(jnp.array([row for _, row in CASES.values()]))
+    for (name, (law, row)), value, slope in zip(CASES.items(), values, slopes, strict=True):
+        true_slope = jnp.stack(jax.jacfwd(law, tuple(range(1, 6)))(dim, *row))
+        seen = np.array([True, True, row[2] > 0.0, True, True])  # at rest the slope by speed has two sides
+        assert_allclose(value, law(dim, *row), atol=EXACT, err_msg=name)
+        assert_allclose(slope[seen], true_slope[seen], atol=EXACT, err_msg=name)
+
+
+def test_a_sphere_stops_spinning():
+    """After I w / (c m g), within a step; the angle it has turned by."""
+
+    def angle(c, w, t):
+        spinning = dr.replace(ball(3), w=vector(0.0, 0.0, 1.0) * w)
+        world = dr.scene({"ball": spinning, "floor": floor(3)}, gravity=(0.0, 0.0, -G), spinning_friction=c)
+        q = at(t, world).q
+        return 2 * jnp.arctan2(q[3], q[0])
+
+    def expected(c, w, t):
+        braking = c * G / (SHARE[3] * RADIUS**2)
+        spins = jnp.minimum(t, w / braking)
+        return w * spins - 0.5 * braking * spins**2
+
+    check_with_slopes(angle, expected, [(0.004, 2.0, 1.0), (0.02, 2.0, 0.97)], jax.jacrev)
+
+
+def test_an_impact_stops_some_of_the_turning():
+    """By at most the coefficient times the normal impulse."""
+
+    def turn(c, w, e):
+        spinning = dr.replace(ball(2, height=1.0, down=2.0), w=w)
+        scene = dr.scene({"ball": spinning, "floor": floor(2)}, restitution=e, rolling_friction=c)
+        return at(jnp.asarray(0.5), scene).w[0]
+
+    def expected(c, w, e):
+        return jnp.maximum(w - c * (1 + e) * 2.0 / (SHARE[2] * RADIUS**2), 0.0)
+
+    check_with_slopes(turn, expected, [(0.01, 3.0, 0.6), (0.1, 3.0, 0.6)], jax.jacfwd)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_energy_falls_and_momenta_are_kept(dim):
+    """Two bodies that meet with spin, with restitution and without."""
+
+    def scene(e, turn):
+        other = dr.Box(half=(0.2, 0.3)) if dim == 2 else dr.Sphere(radius=0.25)
+        w = turn if dim == 2 else turn * vector(1.0, -0.5, 2.0)
+        a = dr.replace(ball(dim, 1.5, 2.0, 0.1), w=w)
+        b = dr.Body(other, mass=0.8, x=1.2 * np.eye(dim)[0], v=-1.0 * np.eye(dim)[0], w=-0.5 * w)
+        kinds = {"rolling_friction": 0.03} | ({} if dim == 2 else {"spinning_friction": 0.02})
+        return dr.scene({"a": a, "b": b}, restitution=e, friction=0.4, **kinds)
+
+    def sums(world, state):
+        laws = dr.momentum, dr.angular_momentum, dr.kinetic_energy
+        return tuple(law(world.bodies, state).sum(0) for law in laws)
+
+    worlds, states = jax.vmap(scene)(jnp.array([0.0, 0.6, 0.6]), jnp.array([2.0, 2.0, -4.0]))
+    path = dr.rollout_batch(worlds, states, dt=1 / 60, steps=45)
+    p, L, energy = jax.vmap(jax.vmap(sums, (None, 0)))(worlds, path)
+    assert_allclose(p, np.broadcast_to(p[:, :1], p.shape), atol=1e-12)
+    assert_allclose(L, np.broadcast_to(L[:, :1], L.shape), atol=1e-10)
+    assert (np.diff(energy, axis=1) < 1e-8 * energy[:, :1]).all()
+    assert (energy[:, -1] < 0.9 * energy[:, 0]).all()
+
+
+def test_mistakes_are_named():
+    bodies = {"ball": ball(2), "floor": floor(2)}
+    with pytest.raises(ValueError, match="rolling_friction is -1: expected 0 or above"):
+        dr.scene(bodies, rolling_friction=-1.0)
+    with pytest.raises(ValueError, match="in 2D nothing turns about a normal; give rolling_friction"):
+        dr.scene(bodies, spinning_friction=0.1)
