@@ -1,5 +1,6 @@
 """The result of a fit: numbers with intervals, what is known of them, and what can be asked of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -143,6 +144,16 @@ class Fit:
     def save(self, path: str | Path) -> Path:
         """Write what is in the table, with versions and seed, as JSON."""
         return self.summary.save(path)
+
+    def report(self, path: str | Path, title: str = "A fit", profiles: Sequence[str] = ()) -> Path:
+        """Write one HTML file that opens offline: the table, what the data cannot tell, the motion, and residuals.
+
+        Args:
+            profiles: shared numbers whose profile likelihood is drawn, each some more fits.
+        """
+        from diffrigid.view import fit_report  # points down, so that a result draws itself
+
+        return fit_report.report(self, path, title, profiles)
 
     def __getitem__(self, name: str) -> Parameter:
         return self.summary[name]
