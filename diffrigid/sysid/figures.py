@@ -58,6 +58,7 @@ def profile_figure(found: Profile) -> Any:
     figure, axes = _axes()
     axes.plot(found.values, found.rise, "o-")
     axes.axhline(found.level, color="0.5", linewidth=0.8)
-    axes.axvspan(found.low, found.high, alpha=0.15)
-    axes.set(xlabel=found.name, ylabel="rise of the cost")
+    ends = found.values[[0, -1]]
+    axes.axvspan(max(found.low, ends[0]), min(found.high, ends[1]), alpha=0.15)
+    axes.set(xlabel=" ".join([found.name, *(f"(open {side})" for side in found.open)]), ylabel="rise of the cost")
     return figure

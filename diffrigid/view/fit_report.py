@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid.step import Trajectory
-from diffrigid.sysid.profile import Profile, profile
+from diffrigid.sysid.profile import Profile, profile, with_profiles
 from diffrigid.sysid.records import Series
 from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.table import HEADER, SHOWN, number_names, rows, summary
@@ -17,6 +17,7 @@ from diffrigid.view.report import Section, chart, matrix, write_report
 from diffrigid.view.report import Series as Curve
 
 LASTS = 4.0  # [s] a motion is slowed down to, if it is shorter
+NEAR = 4.0  # times the level of the interval: what is drawn of a profile
 LEAD = """Values with 95 % intervals, what the data cannot tell, the fitted motion over what was measured, and what is
 left of the residuals. This file needs nothing but itself."""
 
@@ -24,6 +25,7 @@ left of the residuals. This file needs nothing but itself."""
 def report(fit: Any, path: str | Path, title: str, profiles: Sequence[str]) -> Path:
     """Write the page. The motion and the residuals are those of the first three records."""
     found = [profile(fit, name) for name in profiles]
+    fit = with_profiles(fit, found)
     motions = [fit.predict(record=k) for k in range(min(len(fit.scenes), SHOWN))]
     sections = [_numbers(fit), _unknown(fit), _motion(fit, motions), _residuals(fit, motions), _search(fit, found)]
     return write_report(path, title, " ".join(LEAD.split()), [*sections, _origin(fit)])
@@ -139,10 +141,13 @@ def _costs(fit: Any) -> str:
 
 def profile_chart(found: Profile) -> str:
     """Rise of the cost when one number is held; dashed: the ends of its interval."""
-    level = Curve(found.values, np.full(len(found.values), found.level), "95 % level", 1)
-    curves = [Curve(found.values, found.rise), Curve(found.values, found.rise, points=True), level]
-    ends = [end for end in (found.low, found.high) if np.isfinite(end)]
-    return chart(f"Profile of {found.name}", found.name, "rise of the cost", curves, events=ends)
+    near = found.rise < NEAR * found.level
+    values, rise = found.values[near], found.rise[near]
+    level = Curve(values, np.full(len(values), found.level), "95 % level", 1)
+    curves = [Curve(values, rise), Curve(values, rise, points=True), level]
+    ends = [end for end, side in ((found.low, "below"), (found.high, "above")) if side not in found.open]
+    words = f", open {' and '.join(found.open)}" if found.open else ""
+    return chart(f"Profile of {found.name}{words}", found.name, "rise of the cost", curves, events=ends)
 
 
 def _origin(fit: Any) -> Section:
