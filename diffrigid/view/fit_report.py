@@ -27,7 +27,8 @@ def report(fit: Any, path: str | Path, title: str, profiles: Sequence[str]) -> P
     found = [profile(fit, name) for name in profiles]
     fit = with_profiles(fit, found)
     motions = [fit.predict(record=k) for k in range(min(len(fit.scenes), SHOWN))]
-    sections = [_numbers(fit), _unknown(fit), _motion(fit, motions), _residuals(fit, motions), _search(fit, found)]
+    sections = [_numbers(fit), _unknown(fit), _motion(fit, motions), _residuals(fit, motions)]
+    sections += [section for section in (_search(fit, found),) if section.charts]
     return write_report(path, title, " ".join(LEAD.split()), [*sections, _origin(fit)])
 
 
