@@ -3,24 +3,18 @@
 import argparse
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 import diffrigid as dr
 from diffrigid.data import FRAME, SquareDrops, square_drops
-from diffrigid.paths import read, write
 from diffrigid.state import State
-from diffrigid.sysid import Free, command
+from diffrigid.sysid import command
 from diffrigid.view.report import Section, Series, chart, row, text_table, write_report
 
 SIGMA = 0.5  # [mm], [degrees] weight of a residual of a drop: about its size
-STEPS = np.array([5e-3, 2e-3, 1e-5, 1e-4])  # restitution, friction, inertia, floor
-T95 = 2.365  # two-sided 95 % quantile of Student's t for eight drops, seven degrees of freedom
 FINE = 4  # simulated and drawn steps of a drop per measured frame
 CAMERA = 3e-3  # [m] noise of the three discs
 HERTZ, FRAMES, SEED = 60, 120, 7  # of the three discs
@@ -91,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     began = time.time()
     say("1 of 2: eight measured drops of a square, the first impact of each (20 s, mostly compiling)")
-    drops = drop_section(progress, say)
+    drops = drop_section(progress)
     say("2 of 2: three discs, simulated with 3 mm of noise, from 8 starts (15 s)")
     discs = disc_section(progress)
     path = write_report(options.out, "From measured motion to physical parameters", paragraphs(LEAD)[0], [drops, discs])
@@ -115,152 +109,87 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
 # Measured: a square that drops.
 
 
-def drop_world(record: SquareDrops) -> tuple[dr.World, State, list[str]]:
-    """All drops in one world, where they do not see each other, and their names."""
-    names = [f"drop{k + 1}" for k in range(len(record.trial))]
-    square, inertia = dr.Box(half=(record.half, record.half)), 2 / 3 * record.half**2
-    start = zip(names, record.x[:, 0], record.angle[:, 0], record.v, record.w, strict=True)
-    bodies = {name: dr.Body(square, mass=1.0, x=x, angle=angle, v=v, w=w) for name, x, angle, v, w in start}
-    floor = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
-    world, state = dr.scene(
-        {**bodies, "floor": floor},
+def drop_scene(record: SquareDrops, drop: int) -> tuple[dr.World, State]:
+    """The square at the start of a drop, of mass 1, uniform, and the floor."""
+    start = {"x": record.x[drop, 0], "angle": record.angle[drop, 0], "v": record.v[drop], "w": record.w[drop]}
+    inertia = 2 / 3 * record.half**2
+    return dr.scene(
+        {
+            "square": dr.Body(dr.Box(half=(record.half, record.half)), mass=1.0, inertia=inertia, **start),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+        },
         gravity=(0.0, -record.gravity), restitution=0.5, friction=0.1,
         forces=[dr.Drag(linear=record.drag, angular=record.spin_drag * inertia)],
-        ignore=[(a, b) for a in names for b in names if a < b],
     )  # fmt: skip
-    return world, state, names
+
+
+def drop_columns(record: SquareDrops, drop: int) -> dict[str, np.ndarray]:
+    """What was measured of a drop."""
+    return {"t": record.t, "square.x": record.x[drop], "square.angle": record.angle[drop]}
 
 
 def fit_drops(record: SquareDrops, progress: bool | None) -> dr.Fit:
     """Restitution, friction, inertia and floor shared by all drops, and the initial state of each."""
-    world, state, names = drop_world(record)
-    observations, noise = {"t": record.t}, dict[str, float]()
-    free: dict[str | tuple[str, ...], Free] = {"restitution": dr.interval(0, 1), "friction": dr.positive()}
-    free |= {tuple(f"{name}.inertia" for name in names): dr.positive(), "floor.shape.offset": dr.real(0.001)}
-    for k, name in enumerate(names):
-        observations |= {f"{name}.x": record.x[k], f"{name}.angle": record.angle[k]}
-        noise |= {f"{name}.x": 1e-3 * SIGMA, f"{name}.angle": float(np.radians(SIGMA))}
-        free |= {f"{name}.x": dr.real(0.001), f"{name}.v": dr.real(0.02)}
-        free |= {f"{name}.angle": dr.real(0.01), f"{name}.w": dr.real(0.1)}
-    return dr.fit(world, state, observations, free=free, noise=noise, progress=progress)
+    drops = [dr.Record(drop_columns(record, k), state=drop_scene(record, k)[1]) for k in range(len(record.trial))]
+    return dr.fit(
+        *drop_scene(record, 0), drops, progress=progress,
+        noise={"square.x": 1e-3 * SIGMA, "square.angle": float(np.radians(SIGMA))},
+        free={
+            "restitution": dr.interval(0, 1), "friction": dr.positive(), "square.inertia": dr.positive(),
+            "floor.shape.offset": dr.real(0.001),
+            "square.x": dr.each(dr.real(0.001)), "square.v": dr.each(dr.real(0.02)),
+            "square.angle": dr.each(dr.real(0.01)), "square.w": dr.each(dr.real(0.1)),
+        },
+    )  # fmt: skip
 
 
-def neighbours(fit: dr.Fit, record: SquareDrops) -> dr.Trajectory:
-    """The fitted motion, and that a small step away in each number, up and down: 21 worlds on the last axis.
-
-    First the four shared numbers, then a drop's own six, those of all drops at once, because no drop feels
-    another. One batch to compile, for the differences here and for the picture.
-    """
-    names = fit.world.names
-    own: dict[str, Any] = {"x": 1e-4 * np.eye(2), "v": 1e-2 * np.eye(2), "angle": [2e-3], "w": [[0.1]]}
-    shared = ["restitution"], ["friction"], [f"{name}.inertia" for name in names], ["floor.shape.offset"]
-    moves: list[tuple[list[str], Any]] = list(zip(shared, STEPS, strict=True))
-    moves += [([f"{name}.{field}" for name in names], step) for field, steps in own.items() for step in steps]
-
-    def moved(amounts: Array) -> tuple[dr.World, State]:
-        world, state = fit.world, fit.state
-        for (paths, step), amount in zip(moves, amounts, strict=True):
-            for path in paths:
-                value = read(world, state, path)
-                world, state = write(world, state, path, value + amount * jnp.asarray(step, value.dtype))
-        return world, state
-
-    up = jnp.eye(len(moves), dtype=fit.state.x.dtype)
-    amounts = jnp.concatenate([jnp.zeros_like(up[:, :1]), up, -up], axis=1)
-    world, state = jax.jit(jax.vmap(moved, in_axes=-1, out_axes=-1))(amounts)
-    return dr.rollout(world, state, dt=FRAME / FINE, steps=FINE * (len(record.t) - 1))
-
-
-def leave_one_out(residuals: np.ndarray) -> np.ndarray:
-    """How far each drop, left out, moves the four shared numbers, to first order, (B, 4), in STEPS.
-
-    With A_b and r_b the derivatives and residuals of drop b, both freed of what its own six numbers can
-    explain, the minimum moves by (H - A_b^T A_b)^-1 A_b^T r_b, H being the sum of all A^T A.
-
-    Args:
-        residuals: (21, B, m) of the batch of `neighbours`.
-    """
-    centre, ups, downs = np.split(residuals, [1, 1 + len(residuals) // 2])
-    slopes = np.moveaxis((ups - downs) / 2, 0, -1)  # (B, m, 10)
-    own = np.linalg.qr(slopes[:, :, 4:])[0]
-    columns = np.concatenate([slopes[:, :, :4], centre[0][:, :, None]], axis=2)
-    columns -= own @ (np.swapaxes(own, 1, 2) @ columns)
-    A, r = columns[:, :, :4], columns[:, :, 4:]
-    H, pull = np.swapaxes(A, 1, 2) @ A, np.swapaxes(A, 1, 2) @ r
-    return np.linalg.solve(H.sum(0) - H, pull - pull.sum(0))[:, :, 0]
-
-
-def drop_residuals(states: State, record: SquareDrops) -> np.ndarray:
-    """Fitted minus measured x, height [mm] and angle [degrees], (B, T+1, 3, *batch), NaN where unmeasured."""
-    x, q = np.asarray(states.x, float), np.asarray(states.q, float)
-    ones = (1,) * (x.ndim - 3)
-    place = x - np.swapaxes(record.x, 0, 1).reshape(*x.shape[:3], *ones)
-    back = np.exp(-1j * record.angle.T).reshape(*x.shape[:2], *ones)
-    turn = np.angle((q[:, :, 0] + 1j * q[:, :, 1]) * back)
-    return np.swapaxes(np.concatenate([1e3 * place, np.degrees(turn)[:, :, None]], axis=2), 0, 1)
-
-
-def drop_section(progress: bool | None, say: Callable[[str], None]) -> Section:
+def drop_section(progress: bool | None) -> Section:
     """Fit the drops and show them."""
     record = square_drops()
     fit = fit_drops(record, progress)
-    say("       leaving out each drop in turn, for intervals that know of the scatter between drops")
-    near = neighbours(fit, record)
-    residuals = drop_residuals(jax.tree.map(lambda leaf: leaf[::FINE], near.state), record)
-    weighted = np.moveaxis(np.nan_to_num(residuals / SIGMA), -1, 0)
-    moved = leave_one_out(weighted.reshape(*weighted.shape[:2], -1))
-    spread = STEPS * np.sqrt((len(moved) - 1) * moved.var(0))
-    table, narrow = drop_table(fit, spread)
-    t, states, residuals = np.asarray(near.t), jax.tree.map(lambda leaf: leaf[..., 0], near.state), residuals[..., 0]
+    scattered = fit.with_intervals(dr.sandwich)
+    pairs = zip(scattered.parameters, fit.parameters, strict=True)
+    narrow = np.median([float((p.high - p.low) / (q.high - q.low)) for p, q in pairs if not p.records])
+    t = np.linspace(0, record.t[-1], FINE * (len(record.t) - 1) + 1)
+    motions = [fit.predict(times=t, record=k) for k in range(len(record.trial))]
+    residuals = SIGMA * np.stack([np.concatenate([r["square.x"], r["square.angle"]], axis=1) for r in fit.residuals])
     rms = dict(zip(("x", "height", "angle"), np.sqrt(np.nanmean(residuals**2, axis=(0, 1))), strict=True))
+    numbers = sum(fit.problem.sizes) + (len(motions) - 1) * fit.problem.sizes[1]
     return Section(
         title="Measured: a square that drops, eight times",
-        paragraphs=paragraphs(DROP_TEXT, count=len(fit.covariance), narrow=narrow, **rms),
-        table=table,
-        player=drop_player(fit, t, states, record),
-        charts=drop_charts(t, states, record, residuals),
+        paragraphs=paragraphs(DROP_TEXT, count=numbers, narrow=narrow, **rms),
+        table=drop_table(scattered),
+        player=dr.play(
+            {f"drop {k + 1}": motion for k, motion in enumerate(motions)},
+            {f"drop {k + 1}": drop_columns(record, k) for k in range(len(motions))},
+            beside=True, speed=0.02, plot="angle", height=620,
+        ),
+        charts=drop_charts(motions, record, residuals),
         details={"All fitted numbers, with intervals that take residuals as independent": fit._repr_html_()},
-    )
+    )  # fmt: skip
 
 
-def drop_table(fit: dr.Fit, spread: np.ndarray) -> tuple[list[tuple[str, ...]], float]:
-    """Rows of the four shared numbers, and by how much intervals from independent residuals are too narrow."""
-    shared = fit.parameters[: len(spread)]
-    half = T95 * spread
-    narrow = np.median([2 * h / float(p.high - p.low) for p, h in zip(shared, half, strict=True)])
-    e, mu, inertia, floor = (float(p.value) + h * np.array([0.0, -1.0, 1.0]) for p, h in zip(shared, half, strict=True))
-    gyration = 1e3 * np.sqrt(np.maximum(inertia, 0.0))
-    table = [
-        row("square: restitution", e, "-", "0.47 (middle half of impacts: 0.43 to 0.51)"),
-        row("square: friction", mu, "-", "at most 0.14 (95 % of |Pt / Pn|)"),
+def drop_table(fit: dr.Fit) -> list[tuple[str, ...]]:
+    """Rows of the four shared numbers."""
+
+    def numbers(name: str) -> np.ndarray:
+        return np.array([fit[name].value, fit[name].low, fit[name].high], float)
+
+    gyration, floor = 1e3 * np.sqrt(numbers("square.inertia")), 1e3 * numbers("floor.shape.offset")
+    return [
+        row("square: restitution", numbers("restitution"), "-", "0.47 (middle half of impacts: 0.43 to 0.51)"),
+        row("square: friction", numbers("friction"), "-", "at most 0.14 (95 % of |Pt / Pn|)"),
         row("square: radius of gyration", gyration, "mm", "24.5 (uniform square)"),
-        row("square: height of the floor", 1e3 * floor, "mm", "1.75 (under squares at rest)"),
+        row("square: height of the floor", floor, "mm", "1.75 (under squares at rest)"),
     ]
-    return table, float(narrow)
 
 
-def drop_player(fit: dr.Fit, t: np.ndarray, states: State, record: SquareDrops) -> dr.Player:
-    """The drops side by side, each in a world of its own."""
-    shape = dr.HalfSpace(normal=(0.0, 1.0), offset=float(fit["floor.shape.offset"].value))
-    drag = next(force for force in fit.world.forces if isinstance(force, dr.Drag))
-    runs, measured = {}, {}
-    for k in range(len(record.trial)):
-        alone = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[:, k : k + 1], states)
-        inertia, half = float(fit.world.bodies.inertia[k]), (record.half, record.half)
-        square = dr.Body(dr.Box(half=half), mass=1.0, inertia=inertia, x=alone.x[0, 0], q=alone.q[0, 0])
-        bodies: dict[str, dr.Body | dr.Static] = {"square": square, "floor": dr.Static(shape)}
-        world, _ = dr.scene(bodies, gravity=(0.0, -record.gravity), forces=[drag])
-        runs[f"drop {k + 1}"] = dr.Trajectory(t=jnp.asarray(t), state=alone, world=world)
-        measured[f"drop {k + 1}"] = {"t": record.t, "square.x": record.x[k], "square.angle": record.angle[k]}
-    return dr.play(runs, measured, beside=True, speed=0.02, plot="angle", height=620)
-
-
-def drop_charts(fine_t: np.ndarray, states: State, record: SquareDrops, residuals: np.ndarray) -> list[str]:
+def drop_charts(motions: Sequence[dr.Trajectory], record: SquareDrops, residuals: np.ndarray) -> list[str]:
     """Height and angle of a typical and of the worst drop, and the residuals of all."""
     order = np.argsort(np.nanmean(residuals**2, axis=(1, 2)))
     charts = []
     for kind, k in (("typical", order[len(order) // 2]), ("worst", order[-1])):
-        charts += drop_curves(f"drop {k + 1} ({kind})", k, fine_t, states, record)
+        charts += drop_curves(f"drop {k + 1} ({kind})", motions[k], record, k)
     for column, (name, unit) in enumerate((("x", "mm"), ("height", "mm"), ("angle", "degrees"))):
         label = f"fitted - measured [{unit}]"
         lines = [Series(1e3 * record.t, each[:, column]) for each in residuals]
@@ -268,10 +197,11 @@ def drop_charts(fine_t: np.ndarray, states: State, record: SquareDrops, residual
     return charts
 
 
-def drop_curves(title: str, k: int, fine_t: np.ndarray, states: State, record: SquareDrops) -> list[str]:
+def drop_curves(title: str, motion: dr.Trajectory, record: SquareDrops, k: int) -> list[str]:
     """Height and angle of one drop, as long as it was measured."""
-    known = fine_t < record.t[np.isfinite(record.angle[k])][-1] + 0.5 * FRAME / FINE
-    x, q = np.asarray(states.x, float)[known, k], np.asarray(states.q, float)[known, k]
+    t = np.asarray(motion.t, float)
+    known = t < record.t[np.isfinite(record.angle[k])][-1] + 0.5 * FRAME / FINE
+    x, q = np.asarray(motion.state.x, float)[known, 0], np.asarray(motion.state.q, float)[known, 0]
     angle = np.unwrap(np.arctan2(q[:, 1], q[:, 0]))
     angle += 2 * np.pi * np.round((record.angle[k, 0] - angle[0]) / (2 * np.pi))
     charts = []
@@ -279,7 +209,7 @@ def drop_curves(title: str, k: int, fine_t: np.ndarray, states: State, record: S
         ("Height", "mm", 1e3 * x[:, 1], 1e3 * record.x[k, :, 1]),
         ("Angle", "degrees", np.degrees(angle), np.degrees(record.angle[k])),
     ):
-        lines = [Series(1e3 * fine_t[known], curve, "fitted"), Series(1e3 * record.t, points, "measured", 1, True)]
+        lines = [Series(1e3 * t[known], curve, "fitted"), Series(1e3 * record.t, points, "measured", 1, True)]
         charts.append(chart(f"{name}, {title}", "time [ms]", f"{name.lower()} [{unit}]", lines))
     return charts
 

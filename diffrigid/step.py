@@ -30,7 +30,7 @@ class Trajectory:
 
     def _repr_html_(self) -> str | None:
         """The motion itself, in a notebook; a batch is shown as text."""
-        from diffrigid.view import play  # the one import that points down, so that a result draws itself
+        from diffrigid.view import play  # points down, so that a result draws itself
 
         try:
             return play(self)._repr_html_()

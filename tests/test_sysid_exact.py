@@ -165,6 +165,15 @@ def test_score_and_prediction_of_held_out_records(fit):
     assert_allclose(motion.state.x[:, 0], fall, atol=1e-9)
 
 
+def test_records_that_were_fitted_are_scored_from_what_was_found(fit, records, monkeypatch):
+    monkeypatch.setattr(sys.modules["diffrigid.sysid.result"], "SCORED", 0)
+    backwards = records[::-1]
+    residuals = np.concatenate([columns["p.x"].ravel() for columns in fit.residuals])
+    expected = fit.noise["p.x"] * np.sqrt(np.nanmean(residuals**2))
+    assert_allclose(fit.score(backwards)["p.x"], expected, rtol=1e-6)
+    assert fit.score(many(seed=9)[:1])["p.x"] > 5 * expected  # one that was not begins at its own state
+
+
 def test_profile_agrees_with_the_jacobian_where_the_problem_is_nearly_linear():
     free = {"spring.stiffness": dr.positive(), "spring.damping": dr.positive()}
     found = dr.fit(*spring(2.0), spring_record(), free=free, progress=False)
@@ -173,6 +182,21 @@ def test_profile_agrees_with_the_jacobian_where_the_problem_is_nearly_linear():
     # The interval from the Jacobian, to second order in its relative half width.
     assert_allclose([profile.low, profile.high], [value.low, value.high], rtol=2e-3)
     assert profile.rise.argmin() == len(profile.rise) // 2
+    assert profile.open == ()
+
+
+def test_profile_says_where_it_is_open():
+    """Without damping, the cost rises by (a c)^2 / 2 with a = |slopes by c, freed of those by k| / noise, from c = 0."""
+    t, sigma = np.arange(60) / 15, 2e-3
+    data, free = {"t": t, "p.x[0]": np.cos(2 * t)}, {"spring.stiffness": dr.positive(), "spring.damping": dr.positive()}
+    found = dr.fit(*spring(3.9, 0.01), data, free=free, noise={"p.x": sigma}, progress=False)
+    profile = dr.profile(found, "spring.damping")
+    by_c, by_k = 0.25 * np.sin(2 * t) - 0.5 * t * np.cos(2 * t), -0.25 * t * np.sin(2 * t)  # of x at k = 4, c = 0
+    size = np.linalg.norm(by_c - by_k * (by_k @ by_c) / (by_k @ by_k)) / sigma
+    assert profile.open == ("below",) and profile.low == 0.0
+    assert_allclose(profile.high, 1.96 / size, rtol=0.05)  # between values that are a factor e apart
+    table = repr(sysid.with_profiles(found, [profile]))
+    assert "profile, open below" in table and f"0 .. {profile.high:.3g}" in table
 
 
 def spring(stiffness, damping=0.3):

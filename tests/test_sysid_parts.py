@@ -333,10 +333,11 @@ def test_fit_from_the_command_line(tmp_path):
     (tmp_path / "fall.csv").write_text("\n".join(["t,p.x[0],p.x[1]", *lines]) + "\n")
     files, said = [str(tmp_path / name) for name in ("scene.toml", "fall.csv")], io.StringIO()
     with contextlib.redirect_stdout(said):
-        assert main(["fit", *files, "--out", str(tmp_path / "fit.json")]) == 0
+        assert main(["fit", *files, "--out", str(tmp_path / "fit.json"), "--report", str(tmp_path / "fit.html")]) == 0
     assert "gravity[1]" in said.getvalue()
     saved = dr.load_fit(tmp_path / "fit.json")
     assert_allclose(saved["gravity"].value, (0.0, -9.81), atol=1e-6)
+    assert "scene: fall.csv" in (tmp_path / "fit.html").read_text(encoding="utf-8")
     with pytest.raises(SystemExit), contextlib.redirect_stderr(said):
         main(["fit", files[0], str(Path(tmp_path) / "none.csv")])
     assert "none.csv" in said.getvalue()

@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid.sysid.diagnosis import reduced
 
 WIDE = 1.7  # half widths of the 95 % interval within which a truth has to lie: 99.9 %, with the seed fixed
 
@@ -135,6 +136,37 @@ def test_only_the_ratio_of_stiffness_and_mass_is_seen():
     assert any(note == "nothing that was measured depends on p.v[1]" for note in fit.notes)
     assert_allclose(fit["spring.stiffness"].value / fit["p.mass"].value, 4.0, rtol=0.01)
     assert np.isfinite(fit["p.v"].high[0]) and np.isinf(fit["p.v"].high[1])
+
+
+def test_two_ambiguities_at_once_are_named_apart():
+    """Two points, each on a spring of its own: two ratios, which have nothing to do with each other."""
+    bodies = {n: dr.Body(None, mass=2.0, inertia=1.0, x=(x, 0.0)) for n, x in (("a", 1.0), ("b", 1.5))}
+    springs = {
+        f"{n}_spring": dr.SpringDamper(a=n, anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=k)
+        for n, k in (("a", 8.0), ("b", 3.0))
+    }
+    t = np.arange(30) / 15
+    random = np.random.default_rng(0)
+    data = {"t": t} | {
+        f"{n}.x[0]": x * np.cos(w * t) + 1e-3 * random.standard_normal(30)
+        for n, x, w in (("a", 1.0, 2.0), ("b", 1.5, 1.2))
+    }
+    paths = ("a.mass", "b.mass", "a_spring.stiffness", "b_spring.stiffness")
+    fit = dr.fit(*dr.scene(bodies, forces=springs), data, free={path: dr.positive() for path in paths}, progress=False)
+    seen = [note for note in fit.notes if "seen" in note]
+    assert len(seen) == 2
+    for name, note in zip("ab", sorted(seen, key=lambda note: "b.mass" in note), strict=True):
+        assert "only the ratio" in note and f"{name}.mass" in note and f"{name}_spring.stiffness" in note
+    ratios = [fit[f"{n}_spring.stiffness"].value / fit[f"{n}.mass"].value for n in "ab"]
+    assert_allclose(ratios, [4.0, 1.44], rtol=0.01)
+
+
+def test_mixed_directions_come_apart():
+    random = np.random.default_rng(1)
+    apart = np.array([[1.0, -0.5, 0, 0, 0], [0, 0, 0.2, 1.0, 0]])
+    assert_allclose(
+        sorted(np.abs(reduced(random.normal(size=(2, 2)) @ apart)).tolist()), sorted(np.abs(apart).tolist()), atol=1e-12
+    )
 
 
 def test_a_change_that_two_numbers_share_is_written_out():

@@ -7,7 +7,7 @@ from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import Free, direction, each, inertia, interval, positive, prior, real, rotation, shares
 from diffrigid.sysid.gradient import first_order, lbfgs
 from diffrigid.sysid.losses import huber, squares, student
-from diffrigid.sysid.profile import profile
+from diffrigid.sysid.profile import profile, with_profiles
 from diffrigid.sysid.records import Record
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.segments import segments
@@ -57,4 +57,5 @@ __all__ = [
     "squares",
     "start_vector",
     "student",
+    "with_profiles",
 ]

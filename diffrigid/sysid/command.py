@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from diffrigid.scene_file import read_scene
 from diffrigid.sysid.fit import fit
@@ -14,6 +15,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("scene", help="TOML file, see diffrigid/scene_file.py")
     parser.add_argument("data", nargs="+", help="CSV files: columns t, ball.x[0], ball.x[1], ball.angle, ...")
     parser.add_argument("--out", metavar="FILE", help="write the result as JSON")
+    parser.add_argument("--report", metavar="FILE", help="write a page for the browser")
     parser.add_argument("--resume", metavar="FILE", help="start from a result")
     options = parser.parse_args(arguments)
     try:
@@ -28,4 +30,7 @@ def main(arguments: Sequence[str]) -> int:
     print(found)
     if options.out:
         print(f"written to {found.save(options.out)}")
+    if options.report:
+        title = f"{Path(options.scene).stem}: {', '.join(Path(name).name for name in options.data)}"
+        print(f"report: {found.report(options.report, title)}")
     return 0

@@ -67,12 +67,27 @@ def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[
     seen = np.flatnonzero(~unseen)
     scaled = J[:, seen] / sizes[seen]
     values, vectors = np.linalg.eigh(scaled.T @ scaled) if len(seen) else (np.zeros(0), np.zeros((0, 0)))
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value < ALIKE * max(values.max(), 1e-300):
-            direction = np.zeros(len(coordinates))
-            direction[seen] = vector / sizes[seen]
-            out.append(_blind(direction, coordinates))
+    for vector in reduced(vectors[:, values < ALIKE * values.max(initial=1e-300)].T):
+        direction = np.zeros(len(coordinates))
+        direction[seen] = vector / sizes[seen]
+        out.append(_blind(direction, coordinates))
     return out
+
+
+def reduced(rows: np.ndarray) -> np.ndarray:
+    """Another basis of what the rows span, (k, n): each row has a number that is 1 there and 0 in the others.
+
+    Directions that have nothing to do with each other, which an eigenvector may mix, come apart. Source: Gauss-Jordan
+    elimination with complete pivoting.
+    """
+    rows, left = rows.copy(), list(range(len(rows)))
+    while left:
+        k, pivot = np.unravel_index(np.abs(rows[left]).argmax(), rows[left].shape)
+        k = left.pop(k)
+        rows[k] /= rows[k, pivot]
+        others = np.arange(len(rows)) != k
+        rows[others] -= np.outer(rows[others, pivot], rows[k])
+    return rows
 
 
 def _first_record(linear: Linear, numbers: int) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.profile import Profile
 from diffrigid.sysid.result import Fit
+from diffrigid.sysid.table import number_names
 
 
 def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:
@@ -44,9 +45,7 @@ def cost_figure(fit: Fit) -> Any:
 def correlation_figure(fit: Fit) -> Any:
     """Correlations of the shared numbers."""
     figure, axes = _axes(5.0, 4.2)
-    names = [
-        slot.name if slot.size == 1 else f"{slot.name}[{k}]" for slot in fit.problem.shared for k in range(slot.size)
-    ]
+    names = number_names(fit.problem.shared)
     image = axes.imshow(correlations(fit.covariance), vmin=-1, vmax=1, cmap="RdBu")
     axes.set_xticks(range(len(names)), names, rotation=90)
     axes.set_yticks(range(len(names)), names)
@@ -59,6 +58,7 @@ def profile_figure(found: Profile) -> Any:
     figure, axes = _axes()
     axes.plot(found.values, found.rise, "o-")
     axes.axhline(found.level, color="0.5", linewidth=0.8)
-    axes.axvspan(found.low, found.high, alpha=0.15)
-    axes.set(xlabel=found.name, ylabel="rise of the cost")
+    ends = found.values[[0, -1]]
+    axes.axvspan(max(found.low, ends[0]), min(found.high, ends[1]), alpha=0.15)
+    axes.set(xlabel=" ".join([found.name, *(f"(open {side})" for side in found.open)]), ylabel="rise of the cost")
     return figure

@@ -1,6 +1,7 @@
 """Profile likelihood: the best cost when one number is held, and the interval that follows from it."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,8 +12,11 @@ from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, cost_of, levenberg
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import reach_of
+from diffrigid.sysid.summary import Parameter
 
 WIDE = 1.6  # of the half width of the interval from the Jacobian: how far the profile goes on either side
+FURTHER = 3  # times it then goes twice as far, where the cost has not risen to the level
+FAR = 15.0  # z of a bounded number that is at its bound to single precision
 
 
 @dataclass(frozen=True)
@@ -20,32 +24,87 @@ class Profile:
     """Of one number: values, and by how much the cost rises when all others are fitted to each."""
 
     name: str
-    values: np.ndarray  # (P,)
+    values: np.ndarray  # (P,) increasing
     rise: np.ndarray  # (P,)
     level: float  # of the rise, at the ends of the interval
-    low: float  # 95 % interval; the edge of the values where the rise does not reach the level
+    low: float  # 95 % interval; the bound of the parameter where the rise does not reach the level
     high: float
+    open: tuple[str, ...] = ()  # "below", "above": where it does not
+
+    @property
+    def note(self) -> str:
+        """What to say in a table."""
+        return f"profile, open {' and '.join(self.open)}" if self.open else "profile"
 
 
 def profile(fit: Fit, name: str, points: int = 9) -> Profile:
     """Profile of a shared number, its interval being where the cost rises by less than t^2 / 2.
 
-    Unlike an interval from the Jacobian it knows of curvature: it may be lopsided, or open on one side.
+    Unlike an interval from the Jacobian it knows of curvature: it may be lopsided, or open: where the rise does not
+    reach that level, however far the number goes, the data give no limit and the interval ends at the bound.
 
     Args:
-        points: an odd number of values, the fitted one in the middle.
+        points: an odd number of values, the fitted one in the middle; more follow where the interval is wide.
     """
     index = _index(fit, name)
     kind: Any = next(slot.kind for slot in fit.problem.shared if slot.name == name)
     quantile = student_quantile(fit.uncertainty.freedom)
     deviation = float(np.sqrt(fit.covariance[index, index]))
     half = WIDE * quantile * deviation if np.isfinite(deviation) and deviation < 10 else 5.0
+    level, most = 0.5 * quantile**2, np.inf if np.isinf(kind.low) else FAR
     z = fit.shared[index] + np.linspace(-half, half, points)
-    rise = np.maximum(_costs(fit, index, z) - fit.costs[0], 0.0)
-    level = 0.5 * quantile**2
-    low, high = _crossing(z, rise, level, -1), _crossing(z, rise, level, 1)
-    values = kind.value(np.array([*z, low, high]))
-    return Profile(name, values[:-2], rise, level, float(values[-2]), float(values[-1]))
+    z, rise = _extended(fit, index, z, level, points // 2, most)
+    ends = [_crossing(z - fit.shared[index], rise, level, side) for side in (-1, 1)]
+    low, high = (float(kind.value(np.array([fit.shared[index] + end]))[0]) for end in ends)
+    opened = tuple(word for word, end in zip(("below", "above"), ends, strict=True) if np.isnan(end))
+    low, high = kind.low if np.isnan(low) else low, kind.high if np.isnan(high) else high
+    return Profile(name, kind.value(z), rise, level, low, high, opened)
+
+
+def with_profiles(fit: Fit, profiles: Sequence[Profile]) -> Fit:
+    """The fit with the intervals of profiles in its table, and a word on those that are open."""
+    found = {p.name: p for p in profiles}
+
+    def changed(p: Parameter) -> Parameter:
+        if p.name not in found:
+            return p
+        low, high = (np.full_like(p.value, end) for end in (found[p.name].low, found[p.name].high))
+        return replace(p, low=low, high=high, note="; ".join(filter(None, (p.note, found[p.name].note))))
+
+    return replace(fit, summary=replace(fit.summary, parameters=tuple(map(changed, fit.parameters))))
+
+
+def _extended(
+    fit: Fit, index: int, z: np.ndarray, level: float, count: int, most: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """z and the rise of the cost there, with `count` more points at a time outwards until it reaches the level.
+
+    Args:
+        most: size of z beyond which it does not go.
+    """
+    middle, rise, share = z[len(z) // 2], _rises(fit, index, z), np.arange(1, count + 1) / count
+    for side in (-1, 1):
+        for further in range(FURTHER + 1):
+            outer = np.argmax(side * z)
+            last, reached = side * z[outer], rise[outer] > level
+            if reached and further:  # the steps were long: again between the points about the level
+                below = (side * z)[(rise <= level) & (side * z >= side * middle)].max()
+                above = (side * z)[(rise > level) & (side * z > below)].min()
+                new = side * (below + (above - below) * share[:-1])
+            elif not reached and further < FURTHER and last < most:
+                new = side * np.minimum(last + (last - side * middle) * share, most)
+            else:
+                break
+            z, rise = np.concatenate([z, new]), np.concatenate([rise, _rises(fit, index, new)])
+            if reached:
+                break
+    z, order = np.unique(z, return_index=True)
+    rise = rise[order]
+    return z[np.isfinite(rise)], rise[np.isfinite(rise)]
+
+
+def _rises(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
+    return np.maximum(_costs(fit, index, z) - fit.costs[0], 0.0)
 
 
 def _index(fit: Fit, name: str) -> int:
@@ -74,12 +133,12 @@ def _costs(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
     return np.concatenate(out)[: len(z)]
 
 
-def _crossing(z: np.ndarray, rise: np.ndarray, level: float, side: int) -> float:
-    """Where the rise reaches the level on one side of the middle; sqrt(rise) is nearly straight."""
-    middle = len(z) // 2
-    z, rise = z[middle::side], np.sqrt(rise[middle::side])
+def _crossing(away: np.ndarray, rise: np.ndarray, level: float, side: int) -> float:
+    """Where the rise reaches the level on one side of zero, NaN if nowhere; sqrt(rise) is nearly straight."""
+    use = side * away >= 0
+    away, rise = away[use][::side], np.sqrt(rise[use][::side])
     above = np.flatnonzero(rise > np.sqrt(level))
     if not len(above):
-        return float(z[-1])
+        return np.nan
     k = above[0]
-    return float(np.interp(np.sqrt(level), rise[k - 1 : k + 1], z[k - 1 : k + 1]))
+    return float(np.interp(np.sqrt(level), rise[k - 1 : k + 1], away[k - 1 : k + 1]))

@@ -94,6 +94,15 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
     return found
 
 
+def same_data(one: Run, other: Run) -> bool:
+    """True if two records hold the same columns, times and values."""
+    pairs = {s.name: s for s in one.series}, {s.name: s for s in other.series}
+    return pairs[0].keys() == pairs[1].keys() and all(
+        np.array_equal(s.t, pairs[1][name].t) and np.array_equal(s.values, pairs[1][name].values, equal_nan=True)
+        for name, s in pairs[0].items()
+    )
+
+
 def columns(
     world: World, observations: Any, observe: Mapping[str, Any], where: str = "observations"
 ) -> tuple[tuple[Series, ...], dict[str, Channel]]:

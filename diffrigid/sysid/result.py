@@ -1,5 +1,6 @@
 """The result of a fit: numbers with intervals, what is known of them, and what can be asked of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlation
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.parameters import Scene, Slot, knows, reference
+from diffrigid.sysid.records import runs, same_data
 from diffrigid.sysid.setup import Problem, by_column, make_problem, make_starts, reach_of, scene_of, with_noise
 from diffrigid.sysid.summary import Parameter, Summary
 from diffrigid.sysid.table import html_table, text_table
@@ -112,12 +114,16 @@ class Fit:
     def score(self, observations: Any, starts: int = 1, seed: int = 0) -> dict[str, float]:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
 
-        Numbers that every record has for itself are found anew, from several starts if asked for; without such, a
-        record starts from its own state, by default that of the first record of the fit.
+        Numbers that every record has for itself are found anew, from several starts if asked for, the first from its
+        state, by default that of the first record of the fit; of a record that was fitted, from what was found.
         """
-        shared = replace(self.summary, parameters=tuple(p for p in self.parameters if not p.records))
         free, observe = self.problem.free, self.problem.observe
-        problem = make_problem(self.world, self.state, observations, free=free, observe=observe, resume=shared)
+        scored = runs(self.world, self.state, observations, observe, None)
+        fitted = [[k for k, run in enumerate(self.problem.runs) if same_data(run, other)] for other in scored]
+        problem = make_problem(
+            self.world, self.state, observations, free=free, observe=observe, resume=self.summary,
+            places=[found[0] if found else None for found in fitted],
+        )  # fmt: skip
         problem = with_noise(problem, {name: self.noise.get(name, s) for name, s in problem.noise.items()})
         z, reach = make_starts(problem, starts, seed), reach_of(problem, range(problem.sizes[0]))
         z = z._replace(shared=jnp.repeat(z.shared[:, :1], starts, axis=1))
@@ -143,6 +149,16 @@ class Fit:
     def save(self, path: str | Path) -> Path:
         """Write what is in the table, with versions and seed, as JSON."""
         return self.summary.save(path)
+
+    def report(self, path: str | Path, title: str = "A fit", profiles: Sequence[str] = ()) -> Path:
+        """Write one HTML file that opens offline: the table, what the data cannot tell, the motion, and residuals.
+
+        Args:
+            profiles: shared numbers whose profile likelihood is drawn, each some more fits.
+        """
+        from diffrigid.view import fit_report  # points down, so that a result draws itself
+
+        return fit_report.report(self, path, title, profiles)
 
     def __getitem__(self, name: str) -> Parameter:
         return self.summary[name]

@@ -55,13 +55,18 @@ def make_problem(
     noise: Mapping[str, Any] | None = None,
     dt: float | None = None,
     resume: Any = None,
+    places: Sequence[int | None] | None = None,
 ) -> Problem:
-    """Checks all, and puts it into arrays. Arguments as of `fit`."""
+    """Checks all, and puts it into arrays. Arguments as of `fit`.
+
+    Args:
+        places: of each record, that of `resume` whose own numbers it takes; None: none. Default in order.
+    """
     found = runs(world, state, observations, observe or {}, noise)
     pairs = [floats(run.world, run.state) for run in found]
     found = [replace(run, world=w, state=s) for run, (w, s) in zip(found, pairs, strict=True)]
     if resume is not None:
-        found = _resumed(found, resume, free)
+        found = _resumed(found, resume, free, range(len(found)) if places is None else places)
     shared, own = make_slots(free, [scene_of(run) for run in found])
     groups = make_groups(found, (*shared, *own), len(shared), dt)
     problem = Problem(tuple(found), shared, own, tuple(groups), {}, dict(free), dict(observe or {}))
@@ -116,17 +121,17 @@ def _noise_guesses(found: Sequence[Run]) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in guesses.items()}
 
 
-def _resumed(found: list[Run], saved: Any, free: Mapping[Any, Any]) -> list[Run]:
+def _resumed(found: list[Run], saved: Any, free: Mapping[Any, Any], places: Sequence[int | None]) -> list[Run]:
     """Records whose scenes hold the values of an earlier fit, for parameters that are free again."""
     slots = [slot for group in make_slots(free, [scene_of(run) for run in found]) for slot in group]
     parameters = {p.name: p for p in saved.parameters}
     out = []
-    for index, run in enumerate(found):
+    for place, run in zip(places, found, strict=True):
         scene = scene_of(run)
         for slot in slots:
-            if slot.name in parameters:
-                p = parameters[slot.name]
-                value = p.value[index] if p.records else p.value
+            p = parameters.get(slot.name)
+            if p is not None and not (p.records and place is None):
+                value = p.value[place] if p.records else p.value
                 for k, path in enumerate(slot.paths):
                     scene = write(scene, path, jnp.asarray(value[k] if slot.joint else value, scene.state.x.dtype))
         out.append(replace(run, world=scene.world, state=scene.state, channels=scene.channels))

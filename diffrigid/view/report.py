@@ -29,9 +29,11 @@ class Section:
 
     title: str
     paragraphs: Sequence[str] = ()
-    table: Sequence[Row] = ()  # rows under HEADER
+    notes: Sequence[str] = ()  # a list, after the paragraphs
+    table: Sequence[Row] = ()
+    header: Row = HEADER
     player: Player | None = None
-    charts: Sequence[str] = ()  # SVG, from `chart`
+    charts: Sequence[str] = ()  # SVG, from `chart` and `matrix`
     details: Mapping[str, str] | None = None  # summary -> HTML, folded away
 
 
@@ -79,17 +81,25 @@ def text_table(rows: Sequence[Row]) -> str:
     return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
 
-def html_table(rows: Sequence[Row]) -> str:
-    """Rows under HEADER, as HTML."""
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in HEADER)
+def html_table(rows: Sequence[Row], header: Row = HEADER) -> str:
+    """Rows under a header, as HTML."""
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
     lines = ["".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in rows]
     body = "".join(f"<tr>{line}</tr>\n" for line in lines)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>\n'
 
 
-def chart(title: str, x_label: str, y_label: str, series: Sequence[Series], width: int = WIDTH) -> str:
-    """A chart as SVG: axes with ticks, lines and points, a legend above."""
-    x_range = _range([s.x[np.isfinite(s.y)] for s in series], 0.0)
+def chart(
+    title: str, x_label: str, y_label: str, series: Sequence[Series], width: int = WIDTH,
+    events: Sequence[float] = (), margin: float = 0.0,
+) -> str:  # fmt: skip
+    """A chart as SVG: axes with ticks, lines and points, a legend above.
+
+    Args:
+        events: x of dashed lines across.
+        margin: of the range of x, left free on both sides.
+    """
+    x_range = _range([s.x[np.isfinite(s.y)] for s in series], margin)
     y_range = _range([s.y for s in series], 0.06)
     right, bottom = width - RIGHT, HEIGHT - BOTTOM
 
@@ -103,19 +113,44 @@ def chart(title: str, x_label: str, y_label: str, series: Sequence[Series], widt
         *_axes(place, x_range, y_range, (right, bottom)),
         _text("label", (LEFT + right) / 2, HEIGHT - 6, x_label, "middle"),
         f'<g transform="translate(13 {(TOP + bottom) / 2}) rotate(-90)">{_text("label", 0, 0, y_label, "middle")}</g>',
+        *(f'<path class="event" d="M{place(x, 0)[0]:.1f} {TOP}V{bottom}"/>' for x in events),
         *(_marks(s, place) for s in series),
         _legend(series, right),
     ]
     return "".join(parts) + "</svg>\n"
 
 
+def matrix(title: str, names: Sequence[str], values: np.ndarray) -> str:
+    """A square table of numbers from -1 to 1 as SVG, the stronger the larger; colour 0 above zero, 1 below."""
+    count, left = len(names), min(12 + 6.5 * max(map(len, names)), 0.45 * WIDTH)
+    cell = min(46.0, (WIDTH - left - RIGHT) / count)
+    height = TOP + cell * count + 24
+    parts = [
+        f'<svg class="chart" viewBox="0 0 {WIDTH} {height:.0f}" role="img" aria-label="{html.escape(title)}">',
+        _text("title", 0, 14, title, "start"),
+    ]
+    for i, name in enumerate(names):
+        y = TOP + cell * i
+        parts.append(_text("tick", left - 8, y + 0.5 * cell + 4, name, "end"))
+        parts.append(_text("tick", left + cell * (i + 0.5), TOP + cell * count + 14, str(i + 1), "middle"))
+        for j in range(i + 1):
+            x, value = left + cell * j, float(values[i, j])
+            box = f'x="{x:.1f}" y="{y:.1f}" width="{cell - 1:.1f}" height="{cell - 1:.1f}"'
+            parts.append(f'<rect class="c{int(value < 0)}" fill-opacity="{0.7 * abs(value):.2f}" {box}/>')
+            if cell > 26:
+                parts.append(_text("label", x + 0.5 * cell, y + 0.5 * cell + 4, f"{value:.2f}", "middle"))
+    return "".join(parts) + "</svg>\n"
+
+
 def _section(section: Section) -> str:
     parts = [f"<section><h2>{html.escape(section.title)}</h2>\n"]
     if section.table:
-        parts.append(html_table(section.table))
+        parts.append(html_table(section.table, section.header))
     if section.player is not None:
         parts.append(f"<figure>{section.player._repr_html_()}</figure>\n")
     parts += [f"<p>{html.escape(paragraph)}</p>\n" for paragraph in section.paragraphs]
+    if section.notes:
+        parts.append("<ul>" + "".join(f"<li>{html.escape(note)}</li>\n" for note in section.notes) + "</ul>\n")
     if section.charts:
         parts.append('<div class="charts">\n' + "".join(section.charts) + "</div>\n")
     for summary, content in (section.details or {}).items():

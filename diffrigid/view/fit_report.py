@@ -1,0 +1,161 @@
+"""What `fit.report("fit.html")` writes: a page with all that is known of a fit, from the parts of `view.report`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from diffrigid.step import Trajectory
+from diffrigid.sysid.profile import Profile, profile, with_profiles
+from diffrigid.sysid.records import Series
+from diffrigid.sysid.sensors import Part
+from diffrigid.sysid.table import HEADER, SHOWN, number_names, rows, summary
+from diffrigid.view.contacts import find_contacts
+from diffrigid.view.play import Player, play
+from diffrigid.view.report import Section, chart, matrix, write_report
+from diffrigid.view.report import Series as Curve
+
+LASTS = 4.0  # [s] a motion is slowed down to, if it is shorter
+NEAR = 4.0  # times the level of the interval: what is drawn of a profile
+LEAD = """Values with 95 % intervals, what the data cannot tell, the fitted motion over what was measured, and what is
+left of the residuals. This file needs nothing but itself."""
+
+
+def report(fit: Any, path: str | Path, title: str, profiles: Sequence[str]) -> Path:
+    """Write the page. The motion and the residuals are those of the first three records."""
+    found = [profile(fit, name) for name in profiles]
+    fit = with_profiles(fit, found)
+    motions = [fit.predict(record=k) for k in range(min(len(fit.scenes), SHOWN))]
+    sections = [_numbers(fit), _unknown(fit), _motion(fit, motions), _residuals(fit, motions)]
+    sections += [section for section in (_search(fit, found),) if section.charts]
+    return write_report(path, title, " ".join(LEAD.split()), [*sections, _origin(fit)])
+
+
+def _numbers(fit: Any) -> Section:
+    return Section(
+        title="What was found",
+        table=rows(fit),
+        header=(*HEADER[:-1], "remark"),
+        paragraphs=[summary(fit.summary) + "."],
+    )
+
+
+def _unknown(fit: Any) -> Section:
+    title = "What the data cannot tell"
+    if fit.notes:
+        return Section(title=title, notes=fit.notes)
+    text = "Every free number is determined, and the residuals look like independent normal noise."
+    return Section(title=title, paragraphs=[text])
+
+
+def _motion(fit: Any, motions: Sequence[Trajectory]) -> Section:
+    hidden = len(fit.scenes) - len(motions)
+    text = "The fitted motion from the start of each record; dots are what was measured."
+    return Section(
+        title="Motion",
+        player=motion_player(fit, motions),
+        paragraphs=[f"{text} Records that are not drawn: {hidden}." if hidden else text],
+    )
+
+
+def motion_player(fit: Any, motions: Sequence[Trajectory]) -> Player:
+    """The fitted motions side by side, over those columns that are poses or velocities of bodies."""
+    data = {f"record {k}": measured(fit, k) for k in range(len(motions))}
+    known = {name: columns for name, columns in data.items() if columns}
+    x = np.asarray(motions[0].state.x, float)
+    axis = "xyz"[int(np.ptp(x, axis=0).max(0).argmax())]  # along which most happens
+    duration = float(motions[0].t[-1] - motions[0].t[0])
+    speed = min(1.0, float(f"{duration / LASTS:.1g}"))
+    if len(motions) == 1:
+        return play(motions[0], known.get("record 0"), speed=speed, plot=axis)
+    runs = dict(zip(data, motions, strict=True))
+    return play(runs, known or None, beside=True, speed=speed, plot=axis, height=620)
+
+
+def measured(fit: Any, record: int) -> dict[str, Any]:
+    """Columns of a record that are parts of a state, by what they observe, freed of bias, scale and clock."""
+    scene, out = fit.scenes[record], {}
+    for series in fit.problem.runs[record].series:
+        channel = scene.channels[series.name]
+        if isinstance(channel.observer, Part):
+            name = f"{scene.world.names[channel.observer.body]}.{channel.observer.field}"
+            bias, scale, clock = (np.asarray(leaf, float) for leaf in (channel.bias, channel.scale, channel.clock))
+            out[name] = (series.t - clock, (series.values - bias) / scale)
+    return out
+
+
+def _residuals(fit: Any, motions: Sequence[Trajectory]) -> Section:
+    charts = [
+        part
+        for k, motion in enumerate(motions)
+        for series in fit.problem.runs[k].series
+        if (part := residual_chart(fit, k, series, impacts(motion)))
+    ]
+    texts = ["Fitted minus measured, in standard deviations of the noise. Dashed: impacts of the fitted motion."]
+    if len(fit.scenes) > 1:
+        charts.insert(0, _by_record(fit))
+    return Section(title="Residuals", paragraphs=texts, charts=charts)
+
+
+def impacts(motion: Trajectory) -> np.ndarray:
+    """Times [s] of the impacts of a motion."""
+    table = find_contacts(motion, np.asarray(motion.t, float))
+    return np.unique(np.round(table[table[:, 1] == 1, 0], 6))
+
+
+def residual_chart(fit: Any, record: int, series: Series, events: np.ndarray) -> str:
+    """Residuals of one column over time; "" where nothing of it was measured."""
+    values = fit.residuals[record][series.name][: len(series.t)]
+    if not np.isfinite(values).any():
+        return ""
+    count = values.shape[1]
+    curves = [Curve(series.t, values[:, k], f"[{k}]" if count > 1 else "", k % 3, True) for k in range(count)]
+    title = f"{series.name}, record {record}" if len(fit.scenes) > 1 else series.name
+    return chart(title, "time [s]", "residual [standard deviations]", curves, events=events.tolist(), margin=0.02)
+
+
+def _by_record(fit: Any) -> str:
+    """Root mean square of the residuals of every record: which of them do not fit."""
+    joined = [np.concatenate([column.ravel() for column in record.values()]) for record in fit.residuals]
+    size = np.array([np.sqrt(np.nanmean(r**2)) if np.isfinite(r).any() else np.nan for r in joined])
+    curve = Curve(np.arange(len(size)), size, points=True)
+    return chart("Root mean square of each record", "record", "[standard deviations]", [curve], margin=0.02)
+
+
+def _search(fit: Any, found: Sequence[Profile]) -> Section:
+    names = number_names(fit.problem.shared)
+    charts = [_costs(fit)] if len(fit.costs) > 1 else []
+    if len(names) > 1:
+        label = [f"{name}  {k + 1}" for k, name in enumerate(names)]
+        charts.append(matrix("Correlations of the shared numbers", label, fit.correlation))
+    charts += map(profile_chart, found)
+    return Section(title="How well it is found", charts=charts)
+
+
+def _costs(fit: Any) -> str:
+    """Where every start ended, the lowest first."""
+    over = np.where(np.isfinite(fit.costs), fit.costs, np.nan) / max(fit.costs[0], 1e-300)
+    curve = Curve(np.arange(1.0, 1 + len(over)), np.round(np.log10(over), 3), points=True)
+    return chart("Cost of each start", "start", "log10 of cost / lowest", [curve], margin=0.02)
+
+
+def profile_chart(found: Profile) -> str:
+    """Rise of the cost when one number is held; dashed: the ends of its interval."""
+    near = found.rise < NEAR * found.level
+    values, rise = found.values[near], found.rise[near]
+    level = Curve(values, np.full(len(values), found.level), "95 % level", 1)
+    curves = [Curve(values, rise), Curve(values, rise, points=True), level]
+    ends = [end for end, side in ((found.low, "below"), (found.high, "above")) if side not in found.open]
+    words = f", open {' and '.join(found.open)}" if found.open else ""
+    return chart(f"Profile of {found.name}{words}", found.name, "rise of the cost", curves, events=ends)
+
+
+def _origin(fit: Any) -> Section:
+    made = fit.summary
+    versions = ", ".join(f"{name} {value}" for name, value in made.versions.items())
+    many = f" in {len(fit.scenes)} records" if len(fit.scenes) > 1 else ""
+    text = (
+        f"{sum(map(len, fit.linear.rows))} measured numbers{many}; seed {made.seed}; {made.seconds:.1f} s; {versions}."
+    )
+    return Section(title="How it was made", paragraphs=[text])
