@@ -56,7 +56,7 @@ def find_impact(
     """
     live = jnp.any(t1 > 0)
     if closed_form(a.shape, b.shape, straight):
-        s0, level, found = apart(live, lambda *args: approach(*args, straight)[:3], a, b, t1, width)
+        s0, level, found = apart(live, functools.partial(approach, straight=straight), a, b, t1, width)[:3]
     else:
         s0, level, found, _ = approach(a, b, t1, width, straight)
     hit = found & (s0 <= t1) & ~at_end

@@ -219,7 +219,8 @@ def _apply(
     if is_rolling(world):
         strikes, law, held_for = with_rows(world, strikes, law, held_for, flight, t, mobility, kick)
         acting = strikes.active.astype(kick.dtype)
-        crowd, stopped = side_sum(acting, acting, strikes.a, strikes.b, moving), functools.partial(rolling_stops, mobility)
+        crowd = side_sum(acting, acting, strikes.a, strikes.b, moving)
+        stopped = functools.partial(rolling_stops, mobility)
     P = solve_impulses(strikes, *law, mobility, crowd, world.contact.rest_speed)
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     early_P = stopped(strikes, P, law, held_for)
