@@ -89,8 +89,8 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
         "zero": lambda a, b, given: so.difference(b.q, a.q),
         "length": lambda a, b, given: norm(separation(Distance(a=None, **given), so, a, b)),
     }
-    if not {"lower", "upper"} & set(given):
-        at_start.pop("zero")
+    if not {"lower", "upper", *(("friction", "damping") if dim == 3 else ())} & set(given):
+        at_start.pop("zero")  # in the plane the rate of an angle does not depend on where it is counted from
     made = {field: known(at_start[field], a, b, given) for field in fields if field in at_start and field not in given}
     filled = replace(joint, **given, **made, **ends)
     error = known(lambda joint, a, b: joint(so, a, b), filled, a, b)
