@@ -8,7 +8,9 @@ import pytest
 import diffrigid as dr
 
 STEPS, DT, G = 10_000, 1 / 240, 9.81
-GAINED = {"float64": 1e-11, "float32": 2e-3}  # relative: rounding of 10,000 steps, a random walk of sums of about 1
+# Relative: rounding of 10,000 steps of a motion that goes on; what gaps that are closed again make of two discs that rest
+# on each other and on the floor.
+GAINED = {("float64", 1.0): 1e-11, ("float64", 0.9): 1e-6, ("float32", 1.0): 2e-3, ("float32", 0.9): 2e-3}
 
 
 @pytest.mark.parametrize("restitution", [1.0, 0.9])
@@ -31,9 +33,10 @@ def test_ten_thousand_steps(dtype, restitution):
     x, v, w = (np.asarray(leaf, float) for leaf in (states.x, states.v, states.w))
     mass, inertia = np.asarray(world.bodies.mass, float), np.asarray(world.bodies.inertia, float)
     energy = (0.5 * mass * (v**2).sum(2) + 0.5 * inertia * w[..., 0] ** 2 + mass * G * x[..., 1]).sum(1)
-    assert (energy - np.minimum.accumulate(energy)).max() < GAINED[dtype] * energy[0]
+    gained = GAINED[dtype, restitution] * energy[0]
+    assert (energy - np.minimum.accumulate(energy)).max() < gained
     if restitution == 1.0:
-        assert energy.min() > (1 - GAINED[dtype]) * energy[0]
+        assert energy.min() > energy[0] - gained
     inside = 1e-9 if dtype == "float64" else 1e-4  # [m]
     assert x[..., 1].min() > 0.3 - inside and x[..., 0].min() > 0.3 - inside and x[..., 0].max() < 1.7 + inside
     assert np.abs(np.linalg.norm(states.q, axis=2) - 1).max() < 8 * np.finfo(dtype).eps
