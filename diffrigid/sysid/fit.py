@@ -15,6 +15,7 @@ from diffrigid.sysid.free import Chart, Each, Free, Prior
 from diffrigid.sysid.levenberg import Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import split
+from diffrigid.sysid.records import check_mapping
 from diffrigid.sysid.result import Fit, describe
 from diffrigid.sysid.setup import (
     LEAST,
@@ -85,6 +86,7 @@ def fit(
     at_least_one("starts", starts), at_least_one("iterations", iterations)
     stages = _stages(widths, windows)
     _check_parts(loss, solver, intervals, seed, resume)
+    check_mapping("observe", observe)
     problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
     solve = levenberg if solver is None else solver
     z, reach = make_starts(problem, starts, seed), reach_of(problem)

@@ -58,7 +58,7 @@ def make_problem(
     resume: Any = None,
 ) -> Problem:
     """Checks all, and puts it into arrays. Arguments as of `fit`."""
-    found = runs(world, state, observations, {} if observe is None else observe, noise)
+    found = runs(world, state, observations, observe or {}, noise)
     pairs = [floats(run.world, run.state) for run in found]
     found = [replace(run, world=w, state=s) for run, (w, s) in zip(found, pairs, strict=True)]
     if resume is not None:
