@@ -8,6 +8,7 @@ from diffrigid.batch import rollout_batch
 from diffrigid.contact import Contact
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
+from diffrigid.models import load_mjcf, load_urdf
 from diffrigid.pytree import replace
 from diffrigid.scene import Body, Static, scene
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Sphere
@@ -94,6 +95,8 @@ __all__ = [
     "interval",
     "kinetic_energy",
     "load_fit",
+    "load_mjcf",
+    "load_urdf",
     "material_point",
     "material_velocity",
     "momentum",

@@ -15,8 +15,8 @@ from jax import Array, lax
 
 from diffrigid.pytree import map_arrays
 from diffrigid.state import State
-from diffrigid.step import aligned, final_state, floats, scan_steps
-from diffrigid.world import World
+from diffrigid.step import aligned, at_least_one, final_state, floats, scan_steps, step_length
+from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
 LANES = 2**15
 
@@ -35,15 +35,32 @@ def rollout_batch(
     Raises:
         ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps < 1.
     """
+    _check_leaves(world, state)
     world, state = floats(world, state)
     sizes = {size for tree in (world, state) for size in _batch_sizes(tree)}
     if len(sizes) != 1:
         raise ValueError(f"rollout_batch: expected one leading batch axis on some leaf, got lengths {sorted(sizes)}")
-    if not np.all(np.asarray(dt) > 0) or steps < 1:
-        raise ValueError(f"rollout_batch: expected dt > 0 and steps >= 1, got {dt} and {steps}")
+    length, steps = step_length(dt, state), at_least_one("steps", steps)
     count = sizes.pop()
-    chunk = min(chunk or _chunk(world), count)
-    return _run(world, state, jnp.asarray(dt, state.x.dtype), steps, final_only, count, chunk)
+    chunk = min(_chunk(world) if chunk is None else at_least_one("chunk", chunk), count)
+    return _run(world, state, length, steps, final_only, count, chunk)
+
+
+def _check_leaves(world: World, state: State) -> None:
+    """Raise ValueError for what is no world or state, and for a leaf that has more than a batch axis and its own."""
+    check_kinds(world, state)
+    sizes = axis_sizes(world)
+
+    def compare(leaf, letters, path):
+        shape = shape_of_leaf(leaf, path)
+        own = shape[max(len(shape) - len(letters), 0) :]
+        wanted = [sizes.get(letter, size) for letter, size in zip(letters, own, strict=False)]
+        if len(own) < len(letters) or list(own) != wanted or len(shape) > len(letters) + 1:
+            raise ValueError(f"{path} has shape {shape}, expected ([B,] {', '.join(letters)}) in this world")
+        return leaf
+
+    map_arrays(compare, state, "state")
+    map_arrays(compare, world, "world")
 
 
 def _batch_sizes(tree) -> list[int]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid import so2
-from diffrigid.pytree import map_arrays, replace
+from diffrigid.pytree import map_arrays, refuse_missing, replace
 from diffrigid.shapes import dimension, traced, volume_properties, with_topology
 
 TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: what is typed has a few digits
@@ -43,7 +43,7 @@ def stack(rows: Sequence, shape: tuple[int, ...] = ()) -> Numbers:
     return jnp.stack(rows) if traced(rows) else np.stack(rows)
 
 
-def numbers(where: str, value: Any, shape: tuple[int, ...] | None) -> Numbers:
+def numbers(where: str, value: Any, shape: tuple[int, ...] | None, finite: bool = True) -> Numbers:
     """`value` as floats, of this shape unless None, and finite."""
     expected = "numbers" if shape is None else "a number" if shape == () else f"numbers of shape {shape}"
     try:
@@ -52,21 +52,37 @@ def numbers(where: str, value: Any, shape: tuple[int, ...] | None) -> Numbers:
         raise ValueError(f"{where} is {value!r}: expected {expected}.") from error
     if shape is not None and array.shape != shape:
         raise ValueError(f"{where} has shape {array.shape}: expected {expected}, without batch axes.")
-    if not traced(array) and not np.isfinite(array).all():
-        raise ValueError(f"{where} is {array}: expected finite numbers; look for a NaN where it was made.")
+    if finite and not traced(array):
+        if not np.isfinite(array).all():
+            raise ValueError(f"{where} is {array}: expected finite numbers; look for a NaN where it was made.")
+        if (np.abs(array) > largest(array.dtype)).any():
+            raise ValueError(f"{where} is {array}: too large for {array.dtype}, its cube overflows; use other units.")
     return array
+
+
+def largest(dtype: Any) -> float:
+    """The largest number whose cube is finite; one over it is about the smallest whose cube is not zero."""
+    return float(np.cbrt(float(jnp.finfo(dtype).max)))
 
 
 def _array(value: Any) -> Numbers:
     dtype = jnp.result_type(float)
     if not traced(value):
         array = np.asarray(value)
-        if array.dtype.kind not in "iuf":
+        if array.dtype.kind not in "iuf" or np.ma.is_masked(value):
             raise TypeError(f"not numbers: {array.dtype}")
-        return array.astype(dtype)
+        with np.errstate(over="ignore"):  # of a longer type; inf is refused below
+            return array.astype(dtype)
     if isinstance(value, tuple | list):
         return jnp.stack([jnp.asarray(_array(part)) for part in value])
     return jnp.asarray(value, dtype)
+
+
+def known_number(where: str, value: Any) -> Numbers:
+    """A number that is not traced."""
+    if traced(value):
+        raise ValueError(f"{where} is traced: expected a number that is known.")
+    return numbers(where, value, ())
 
 
 def positive(where: str, value: Any, fix: str) -> Numbers:
@@ -74,6 +90,10 @@ def positive(where: str, value: Any, fix: str) -> Numbers:
     array = numbers(where, value, ())
     if not traced(array) and not array > 0:
         raise ValueError(f"{where} is {float(array):g}: expected above 0; {fix}.")
+    if not traced(array) and array < 1 / largest(array.dtype):
+        raise ValueError(
+            f"{where} is {float(array):g}: too small for {array.dtype}, its cube vanishes; use other units."
+        )
     return array
 
 
@@ -122,9 +142,14 @@ def orientation(name: str, body: Any, dim: int) -> Numbers:
         return known(so2.exp, numbers(f"{name}.angle", body.angle, ())[None])
     unturned = (1.0, 0.0) if dim == 2 else (1.0, 0.0, 0.0, 0.0)
     q = numbers(f"{name}.q", unturned if body.q is None else body.q, (len(unturned),))
+    return unit_quaternion(f"{name}.q", q)
+
+
+def unit_quaternion(where: str, q: Numbers) -> Numbers:
+    """q, (2,) or (4,), of length one to rounding."""
     length = (jnp if traced(q) else np).sqrt((q * q).sum())
     if not traced(q) and abs(length - 1) > TYPED:
-        raise ValueError(f"{name}.q has length {length:.6g}: expected 1; divide it by its length.")
+        raise ValueError(f"{where} has length {length:.6g}: expected 1; divide it by its length.")
     return q / length
 
 
@@ -235,11 +260,17 @@ def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
     """A force with indices for the names of bodies, and arrays with the axes of their fields for numbers."""
     if isinstance(force, type) or not callable(force) or not hasattr(force, "__dataclass_fields__"):
         raise ValueError(f"forces: {name!r} is {force!r}: expected a record such as Drag(linear=0.1).")
+    refuse_missing(force, name)
+    if not isinstance(getattr(force, "control", None), str | None):
+        raise ValueError(f"{name}.control is {force.control!r}: expected the name of a control, or None.")
     changes: dict[str, Any] = {}
     for field in ("body", "a", "b"):
         target = getattr(force, field, None)
-        if target is not None and target not in bodies:
-            raise ValueError(f"{name}.{field} is {target!r}, which is not a moving body: {nearest(target, bodies)}")
+        needed = hasattr(force, field) and field != "b"
+        if (needed or target is not None) and (not isinstance(target, str) or target not in bodies):
+            raise ValueError(
+                f"{name}.{field} is {target!r}, which is not a moving body: {nearest(str(target), bodies)}"
+            )
         if target is not None:
             changes[field] = bodies.index(target)
     sizes = {"N": len(bodies), "D": dim, "A": 1 if dim == 2 else 3, "Q": 2 if dim == 2 else 4}

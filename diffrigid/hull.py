@@ -155,4 +155,10 @@ def extent(corners):
 
 def triples(faces):
     """`faces` as a tuple of triples of int."""
-    return tuple(tuple(int(i) for i in face) for face in faces)
+    try:
+        rows = np.asarray(faces)
+    except ValueError:
+        rows = np.zeros(0)
+    if rows.ndim != 2 or rows.shape[1] != 3 or rows.dtype.kind not in "iu":
+        raise ValueError(f"Hull.faces is {faces!r}: expected triples of indices of vertices; leave it out.")
+    return tuple(tuple(row) for row in rows.tolist())

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffrigid.convert import TYPED, known, nearest, numbers, stack
+from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
 from diffrigid.joints import JOINTS, Distance, Pose, separation
 from diffrigid.linkage import jacobian
 from diffrigid.numerics import norm
-from diffrigid.pytree import array_fields, letters_of, replace
+from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
 from diffrigid.shapes import traced
 from diffrigid.state import rotations
 
@@ -35,9 +35,10 @@ def joints_of(
         if not isinstance(joint, JOINTS):
             known_kinds = ", ".join(kind.__name__ for kind in JOINTS)
             raise ValueError(f"joints: {name!r} is {joint!r}: expected one of {known_kinds}.")
+        refuse_missing(joint, name)
         for side in ("a", "b"):
             body = getattr(joint, side)
-            if body not in colliders and (side == "a" or body is not None):
+            if (not isinstance(body, str) or body not in colliders) and (side == "a" or body is not None):
                 raise ValueError(f"{name}.{side} is {body!r}, which is not a body: {nearest(body, colliders)}")
         if joint.a not in moving and joint.b not in moving:
             raise ValueError(f"{name} joins {joint.a!r} to {joint.b!r}: expected one that moves; name a Body.")
@@ -74,7 +75,13 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
             shape = shapes[letters_of(joint, field)]
             array = numbers(f"{name}.{field}", value, None)
             array = numbers(f"{name}.{field}", array * np.ones(shape, array.dtype) if array.ndim == 0 else array, shape)
-            given[field] = _unit(f"{name}.{field}", array) if field.startswith("axis") else array
+            given[field] = array
+            if field.startswith("axis"):
+                given[field] = _unit(f"{name}.{field}", array)
+            elif field in ("q", "zero"):
+                given[field] = unit_quaternion(f"{name}.{field}", array)
+            elif field == "length":
+                given[field] = positive(f"{name}.{field}", array, "for a length of 0 use a Ball")
     at_start = {
         "anchor_b": lambda a, b, given: so.unrotate(b.q, a.x + so.rotate(a.q, given["anchor_a"]) - b.x),
         "axis_b": lambda a, b, given: so.unrotate(b.q, so.rotate(a.q, given["axis_a"])),
@@ -82,8 +89,8 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
         "zero": lambda a, b, given: so.difference(b.q, a.q),
         "length": lambda a, b, given: norm(separation(Distance(a=None, **given), so, a, b)),
     }
-    if not {"lower", "upper"} & set(given):
-        at_start.pop("zero")
+    if not {"lower", "upper", *(("friction", "damping") if dim == 3 else ())} & set(given):
+        at_start.pop("zero")  # in the plane the rate of an angle does not depend on where it is counted from
     made = {field: known(at_start[field], a, b, given) for field in fields if field in at_start and field not in given}
     filled = replace(joint, **given, **made, **ends)
     error = known(lambda joint, a, b: joint(so, a, b), filled, a, b)

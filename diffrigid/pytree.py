@@ -92,6 +92,13 @@ def align(node, rank: int):
     return map_arrays(expand, node)
 
 
+def refuse_missing(record, where: str) -> None:
+    """Raise ValueError for a float leaf that is None, but where that is its default."""
+    for field in dataclasses.fields(record):
+        if "letters" in field.metadata and field.default is not None and getattr(record, field.name) is None:
+            raise ValueError(f"{where}.{field.name} is None: expected numbers.")
+
+
 def array_fields(record) -> list[str]:
     """Names of the float leaves of a record."""
     return [field.name for field in dataclasses.fields(record) if "letters" in field.metadata]

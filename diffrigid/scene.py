@@ -1,7 +1,7 @@
 """`scene`: from bodies as a user writes them to `(World, State)`. All checks of values are made here."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +28,7 @@ from diffrigid.convert import (
 from diffrigid.forces import Gravity
 from diffrigid.joint_checks import joints_of, warn_of_torn_joints
 from diffrigid.overlap import overlapping, place
-from diffrigid.pytree import map_arrays
+from diffrigid.pytree import map_arrays, refuse_missing
 from diffrigid.shape_checks import check_shape
 from diffrigid.shapes import HalfSpace, Hull, Polygon, Shape, dimension, traced
 from diffrigid.state import COEFFICIENTS, Bodies, State
@@ -124,6 +124,8 @@ def scene(
     dim, n = _dimension(moving, gravity), len(moving)
     named_forces = _forces(forces, gravity, everything, moving, dim)
     joined, linked, joint_names = _joints(joints, named_forces, moving, still, dim)
+    if isinstance(ignore, str) or not isinstance(ignore, Iterable):
+        raise ValueError(f"ignore is {ignore!r}: expected pairs of names, [('arm', 'hand')].")
     passing = _passing([*ignore, *joined], list(everything))
     shapes = {k: None if b.shape is None else shape_of(k, b.shape, dim) for k, b in everything.items()}
     solids = {name: solid_of(shapes[name], dim) for name in moving}
@@ -181,10 +183,10 @@ def _sorted(bodies: Mapping[str, Body | Static]) -> tuple[dict[str, Body], dict[
 def _passing(ignore: Any, names: list[str]) -> set[frozenset[int]]:
     """The pairs of `ignore` as sets of two colliders."""
     for pair in ignore:
-        if isinstance(pair, str) or len(pair) != 2:
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
             raise ValueError(f"ignore has {pair!r}: expected pairs of names, [('arm', 'hand')]; add a bracket.")
         for name in pair:
-            if name not in names:
+            if not isinstance(name, str) or name not in names:
                 raise ValueError(f"ignore names {name!r}, which is not a body: {nearest(name, names)}")
     return {frozenset(names.index(name) for name in pair) for pair in ignore}
 
@@ -274,7 +276,8 @@ def _joints(joints: Any, named: Mapping, moving: Mapping, still: Mapping, dim: i
 def _contact(contact: Any) -> Contact:
     if not isinstance(contact, Contact):
         raise ValueError(f"contact is {contact!r}: expected a Contact(width=0.0).")
-    if not isinstance(contact.sweeps, int) or contact.sweeps < 1:
+    refuse_missing(contact, "contact")
+    if not isinstance(contact.sweeps, int) or isinstance(contact.sweeps, bool) or contact.sweeps < 1:
         raise ValueError(f"contact.sweeps is {contact.sweeps!r}: expected an integer above 0; leave it out.")
 
     def check(leaf, letters, path):

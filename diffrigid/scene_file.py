@@ -81,7 +81,7 @@ def read_scene(path: str | Path) -> SceneFile:
     try:
         with open(path, "rb") as file:
             data = tomllib.load(file)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no TOML file: {error}") from None
     for key in data:
         if key not in (*TABLES, *ARGUMENTS):

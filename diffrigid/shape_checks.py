@@ -2,11 +2,11 @@
 
 import math
 
-import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.convert import largest, numbers
 from diffrigid.hull import FLAT, extent, faces_problem, first, hull_problem, triples
-from diffrigid.pytree import map_arrays
+from diffrigid.pytree import map_arrays, refuse_missing
 from diffrigid.shapes import (
     SHAPES,
     Box,
@@ -33,6 +33,7 @@ def check_shape(shape: Shape, where: str) -> None:
     if not isinstance(shape, SHAPES):
         names = ", ".join(kind.__name__ for kind in SHAPES)
         raise ValueError(f"{where} is {shape!r}: expected one of {names}.")
+    refuse_missing(shape, where)
 
     def check(leaf, letters, path):
         _check_axes(leaf, letters, path, dimension(shape) if len(letters) == 2 else None)
@@ -50,7 +51,7 @@ def check_shape(shape: Shape, where: str) -> None:
 def _check_axes(leaf, letters, path, dim):
     """Raise ValueError unless the shape of `leaf` is what `letters` ask for in one world."""
     try:
-        shape = jnp.shape(floats(leaf))
+        shape = numbers(path, leaf, None, finite=False).shape
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path} is {leaf!r}: expected numbers in rows of equal length.") from error
     fits, expected = {
@@ -66,6 +67,10 @@ def _check_values(shape, value, path, field):
     """Raise ValueError for the first thing that is wrong with the concrete `value` of one leaf."""
     if not np.isfinite(value).all():
         raise ValueError(f"{path} is not finite ({value}): look for a division by zero where it was made.")
+    size = np.abs(value) if value.ndim < 2 else np.ptp(value, axis=0)
+    most = largest(value.dtype)
+    if (np.abs(value) > most).any() or ((size > 0) & (size < 1 / most)).any() and not isinstance(shape, HalfSpace):
+        raise ValueError(f"{path} is {value} m: its cube leaves the range of {value.dtype}; use other units.")
     rule = _RULES.get((type(shape), field))
     if rule and (problem := rule(value)):
         raise ValueError(f"{path} {problem}")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.convert import largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import with_tangents
@@ -52,7 +53,7 @@ def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
     """
     check(world, state)
     world, state = floats(world, state)
-    return _step_jit(world, state, _time(dt, "dt", state), controls)
+    return _step_jit(world, state, step_length(dt, state, batch=True), controls)
 
 
 def rollout(
@@ -79,19 +80,16 @@ def rollout(
     if (steps is None) == (times is None):
         raise ValueError(f"rollout: give either steps or times, got {'neither' if steps is None else 'both'}")
     world, state = floats(world, state)
-    longest = _time(dt, "dt", state)
+    longest = step_length(dt, state)
     if times is None:
-        if not isinstance(steps, int | np.integer) or steps < 1:
-            raise ValueError(f"steps is {steps!r}, expected an integer >= 1")
-        t = longest * jnp.arange(steps + 1, dtype=longest.dtype) if longest.ndim == 0 else None
-        if t is None:
-            raise ValueError(f"dt has shape {longest.shape}, expected a number")
-        states = _rollout_jit(world, state, jnp.broadcast_to(longest, (steps,)), controls, (1,) * steps)
+        count = at_least_one("steps", steps)
+        t = longest * jnp.arange(count + 1, dtype=longest.dtype)
+        states = _rollout_jit(world, state, jnp.broadcast_to(longest, (count,)), controls, (1,) * count)
         return Trajectory(t=t, state=states, world=world)
-    t = jnp.asarray(times, state.x.dtype)
-    counts = _substeps(t, longest) if substeps is None else tuple(substeps)
-    if t.ndim != 1 or len(counts) != t.shape[0] - 1 or not counts:
-        raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1, and substeps T integers")
+    t = jnp.asarray(numbers("times", times, None), state.x.dtype)
+    if t.ndim != 1 or t.shape[0] < 2:
+        raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
+    counts = _substeps(t, longest) if substeps is None else _given_substeps(substeps, t.shape[0] - 1)
     return Trajectory(t=t, state=_rollout_jit(world, state, jnp.diff(t), controls, counts), world=world)
 
 
@@ -101,11 +99,35 @@ def floats(world: World, state: State) -> tuple[World, State]:
     return jax.tree.map(lambda leaf: lax.convert_element_type(jnp.asarray(leaf), dtype), (world, state))
 
 
-def _time(value: Any, name: str, state: State) -> Array:
-    value = jnp.asarray(value, state.x.dtype)
-    if not isinstance(value, jax.core.Tracer) and not (np.asarray(value) > 0).all():
-        raise ValueError(f"{name} is {value}, expected > 0 [s]")
-    return value
+def step_length(dt: Any, state: State, batch: bool = False) -> Array:
+    """dt as an array of the type of the state, checked where it is known; a number unless it may be of a `batch`."""
+    array = jnp.asarray(numbers("dt", dt, None, finite=False), state.x.dtype)
+    allowed = state.x.shape[2:] if batch else ()
+    if array.ndim and array.shape != allowed:
+        raise ValueError(f"dt has shape {array.shape}, expected a number" + batch * f" or {allowed} like the batch")
+    if not isinstance(array, jax.core.Tracer) and not ((np.asarray(array) > 0) & (array < largest(array.dtype))).all():
+        raise ValueError(f"dt is {array}, expected > 0 [s] and finite")
+    return array
+
+
+def at_least_one(name: str, count: Any) -> int:
+    """A number of steps, or of worlds."""
+    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
+        raise ValueError(f"{name} is {count!r}, expected an integer >= 1")
+    return int(count)
+
+
+def _given_substeps(substeps: Any, intervals: int) -> tuple[int, ...]:
+    """Steps of each interval, as given."""
+    try:
+        counts = tuple(at_least_one("substeps", count) for count in substeps)
+    except (TypeError, ValueError):
+        counts = ()
+    if len(counts) != intervals:
+        raise ValueError(
+            f"substeps is {substeps!r}, expected {intervals} integers >= 1, one for each interval of times"
+        )
+    return counts
 
 
 def _substeps(t: Array, longest: Array) -> tuple[int, ...]:

@@ -3,11 +3,12 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from diffrigid.collide import PairGroup
 from diffrigid.contact import Contact
-from diffrigid.pytree import array, map_arrays, pytree, stacked, static
+from diffrigid.pytree import array, map_arrays, pytree, refuse_missing, stacked, static
 from diffrigid.state import Bodies, State
 
 
@@ -72,18 +73,35 @@ def axis_sizes(world: World) -> dict[str, int]:
     return sizes | {"D": dim, "A": 1 if dim == 2 else 3, "Q": 2 if dim == 2 else 4}
 
 
-def check(world: World, state: State) -> None:
-    """Raise ValueError where shapes or types of `state` and `world` do not fit. Costs nothing at run time."""
+def check_kinds(world: Any, state: Any) -> None:
+    """Raise ValueError for what is not (world, state)."""
     if not isinstance(world, World) or not isinstance(state, State):
         raise ValueError(
             f"expected (world, state), got ({type(world).__name__}, {type(state).__name__}): "
             "both come from `diffrigid.scene`, in this order."
         )
+    if not isinstance(world.bodies, Bodies):
+        raise ValueError(f"world.bodies is a {type(world.bodies).__name__}: expected the Bodies that `scene` made.")
+
+
+def shape_of_leaf(leaf: Any, path: str) -> tuple[int, ...]:
+    """Shape of an array or a number."""
+    if not hasattr(leaf, "shape") and not isinstance(leaf, int | float):
+        raise ValueError(f"{path} is a {type(leaf).__name__}: expected an array; convert it with jnp.asarray.")
+    if isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biuf":
+        raise ValueError(f"{path} has type {leaf.dtype}: expected floating point.")
+    return jnp.shape(leaf)
+
+
+def check(world: World, state: State) -> None:
+    """Raise ValueError where shapes or types of `state` and `world` do not fit. Costs nothing at run time."""
+    check_kinds(world, state)
+    refuse_missing(state, "state")
     sizes = axis_sizes(world)
     batches: dict[tuple[int, ...], str] = {}
 
     def compare(leaf: Any, letters: tuple[str, ...], path: str):
-        shape = jnp.shape(leaf)
+        shape = shape_of_leaf(leaf, path)
         head = shape[: len(letters)]
         known = [sizes.get(letter, size) for letter, size in zip(letters, head, strict=False)]
         if len(head) < len(letters) or list(head) != known:

@@ -150,3 +150,23 @@ def test_a_batch_in_single_precision():
 def test_mistakes_are_named(along, message):
     with pytest.raises(ValueError, match=message):
         wheel(1.0, **along)
+
+
+def test_damping_and_friction_in_space_of_bodies_that_are_turned_at_the_start():
+    """The rate along the axis is that of the hinge, however the two bodies lie: I dw/dt = -damping w, or -friction."""
+    damping, friction, speed, t = 0.2, 0.3, 2.0, 0.25
+    axis, q = np.array([0.0, 0.6, 0.8]), np.array([0.5, 0.5, 0.5, -0.5])  # a third of a turn
+    turn = dr.state.rotations(3)
+    world_axis = np.asarray(turn.rotate(jnp.asarray(q), jnp.asarray(axis)))
+    bodies = {
+        name: dr.Body(None, mass=1.0, inertia=INERTIA, x=(x, 0.0, 0.0), q=q, w=speed * world_axis)
+        for name, x in (("damped", 0.0), ("rubbed", 1.0))
+    }
+    joints = {
+        "damper": dr.Revolute("damped", anchor_a=0.0, axis_a=axis, damping=damping),
+        "brake": dr.Revolute("rubbed", anchor_a=0.0, axis_a=axis, friction=friction),
+    }
+    world, state = dr.scene(bodies, joints=joints)
+    w = dr.rollout(world, state, dt=1 / RATE, steps=round(t * RATE)).state.w[-1]
+    assert_allclose(w[0], speed * np.exp(-damping * t / INERTIA) * world_axis, atol=1e-8)
+    assert_allclose(w[1], (speed - friction * t / INERTIA) * world_axis, atol=1e-8)

@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from diffrigid.convert import numbers
 from diffrigid.state import State
+from diffrigid.step import at_least_one
 from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
 from diffrigid.sysid.free import Chart, Each, Free, Prior
 from diffrigid.sysid.levenberg import Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import split
+from diffrigid.sysid.records import check_mapping
 from diffrigid.sysid.result import Fit, describe
 from diffrigid.sysid.setup import (
     LEAST,
@@ -80,12 +83,14 @@ def fit(
         ValueError: unknown names, wrong shapes, or a parameter that nothing measured depends on.
     """
     began = time.time()
-    _check(starts=starts, iterations=iterations, widths=widths, windows=windows)
+    at_least_one("starts", starts), at_least_one("iterations", iterations)
+    stages = _stages(widths, windows)
+    _check_parts(loss, solver, intervals, seed, resume)
+    check_mapping("observe", observe)
     problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
     solve = levenberg if solver is None else solver
     z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)
-    stages = [(width, windows[0]) for width in widths] + [(widths[-1], window) for window in windows[1:]]
     estimate, stopped = bool(problem.noise), False
     point: Any = None
     for number, (width, window) in enumerate(stages):
@@ -103,14 +108,33 @@ def fit(
     return finish(problem, point, loss, intervals, seed, began, ["interrupted: the best so far"] if stopped else [])
 
 
-def _check(starts: int, iterations: int, widths: Sequence[float], windows: Sequence[float]) -> None:
-    for name, value in (("starts", starts), ("iterations", iterations)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name} is {value!r}, expected an integer >= 1")
-    if not len(widths) or min(widths) < 0:
-        raise ValueError(f"widths is {widths!r}, expected lengths >= 0 [m], the last one usually 0")
-    if not len(windows) or min(windows) <= 0:
+def _stages(widths: Sequence[float], windows: Sequence[float]) -> list[tuple[float, float]]:
+    """(width, window) of the fits that follow each other."""
+    wide, long = _lengths("widths", widths, "[m], the last one usually 0"), _lengths("windows", windows, "[s]")
+    if not (long > 0).all():
         raise ValueError(f"windows is {windows!r}, expected times > 0 [s], the last one usually inf")
+    return [(width, long[0]) for width in wide] + [(wide[-1], window) for window in long[1:]]
+
+
+def _lengths(name: str, values: Any, unit: str) -> np.ndarray:
+    """Some numbers >= 0, (n,); times may be inf."""
+    array = np.asarray(numbers(name, values, None, finite=name == "widths"))
+    if array.ndim != 1 or not array.size or not (array >= 0).all():
+        raise ValueError(f"{name} is {values!r}, expected a sequence of numbers >= 0 {unit}")
+    return array
+
+
+def _check_parts(loss: Any, solver: Any, intervals: Any, seed: Any, resume: Any) -> None:
+    if isinstance(loss, type) or not hasattr(loss, "rho"):
+        raise ValueError(f"loss is {loss!r}, expected squares(), huber() or student()")
+    if solver is not None and not callable(solver):
+        raise ValueError(f"solver is {solver!r}, expected None, first_order(optax.adam(1e-2)) or lbfgs()")
+    if not callable(intervals):
+        raise ValueError(f"intervals is {intervals!r}, expected from_jacobian, sandwich or bootstrap")
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"seed is {seed!r}, expected an integer >= 0")
+    if resume is not None and not isinstance(resume, Fit | Summary):
+        raise ValueError(f"resume is a {type(resume).__name__}, expected a Fit, or what load_fit read")
 
 
 def finish(

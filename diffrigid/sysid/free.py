@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid import so2, so3
+from diffrigid.convert import coefficient, known_number, numbers
 
 NEAR_BOUND = 1e-3  # [-] of an interval: a start on a bound is pulled off it, a result this close is reported
 PULL = 1e-3  # a start at or below the bound of a positive parameter begins this far above it, in its unit
@@ -124,39 +125,40 @@ class Prior:
 
 def interval(low: float, high: float) -> Free:
     """A parameter between two bounds."""
+    low, high = (float(known_number(f"interval: {end}", value)) for end, value in (("low", low), ("high", high)))
     if not low < high:
         raise ValueError(f"interval({low}, {high}): expected low < high")
-    return Free(low=float(low), high=float(high))
+    return Free(low=low, high=high)
 
 
 def positive(spread: float = 0.5) -> Free:
     """A parameter > 0; random starts are a factor exp(spread N(0, 1)) away."""
-    return Free(low=0.0, spread=spread)
+    return Free(low=0.0, spread=_spread(spread))
 
 
 def real(spread: float = 0.5) -> Free:
     """Any number; random starts are spread * max(rms, 1) N(0, 1) away."""
-    return Free(spread=spread)
+    return Free(spread=_spread(spread))
 
 
 def direction(spread: float = 0.5) -> Chart:
     """A vector of which only the direction varies, by an angle in 2D and by two in 3D: {"gravity": direction()}."""
-    return Chart(name="direction", size_of=_direction_size, map=_turned_vector, spread=spread)
+    return Chart(name="direction", size_of=_direction_size, map=_turned_vector, spread=_spread(spread))
 
 
 def rotation(spread: float = 0.5) -> Chart:
     """An orientation, turned by exp(z) in world axes, one angle in 2D and three in 3D: {"die.q": rotation()}."""
-    return Chart(name="rotation", size_of=_rotation_size, map=_turned, spread=spread)
+    return Chart(name="rotation", size_of=_rotation_size, map=_turned, spread=_spread(spread))
 
 
 def inertia(spread: float = 0.3) -> Chart:
     """A (3, 3) inertia that stays one of a mass distribution: {"die.inertia": inertia()}."""
-    return Chart(name="inertia", size_of=_inertia_size, map=_physical_inertia, spread=spread)
+    return Chart(name="inertia", size_of=_inertia_size, map=_physical_inertia, spread=_spread(spread))
 
 
 def shares(spread: float = 0.5) -> Chart:
     """Ratios of several numbers: {("cue.mass", "ball.mass"): shares()} keeps the sum of both."""
-    return Chart(name="shares", size_of=_shares_size, map=_same_sum, spread=spread)
+    return Chart(name="shares", size_of=_shares_size, map=_same_sum, spread=_spread(spread))
 
 
 def each(kind: Any) -> Each:
@@ -166,10 +168,19 @@ def each(kind: Any) -> Each:
 
 def prior(kind: Any, mean: Any, deviation: Any) -> Prior:
     """A Gaussian prior beside the data: {"ball.mass": prior(positive(), 1.2, 0.1)}."""
-    if not np.all(np.asarray(deviation, float) > 0):
+    means, deviations = numbers("prior: mean", mean, None).ravel(), numbers("prior: deviation", deviation, None).ravel()
+    if not (deviations > 0).all():
         raise ValueError(f"prior: deviation is {deviation}, expected > 0, in the unit of the parameter")
-    flat = tuple(np.ravel(np.asarray(mean, float)).tolist())
-    return Prior(kind=kind, mean=flat, deviation=tuple(np.ravel(np.asarray(deviation, float)).tolist()))
+    if not means.size or deviations.size not in (1, means.size):
+        raise ValueError(
+            f"prior: {means.size} means and {deviations.size} deviations, expected as many, or one for all"
+        )
+    return Prior(kind=kind, mean=tuple(means.tolist()), deviation=tuple(deviations.tolist()))
+
+
+def _spread(spread: Any) -> float:
+    """How far random starts are away."""
+    return float(coefficient("spread", spread))
 
 
 def _sigmoid(z: np.ndarray) -> np.ndarray:

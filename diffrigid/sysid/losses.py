@@ -10,6 +10,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from diffrigid.convert import positive
+
 
 @dataclass(frozen=True)
 class Squares:
@@ -65,6 +67,4 @@ def student(nu: float = 4.0) -> Student:
 
 
 def _above_zero(name: str, value: Any) -> float:
-    if not value > 0:
-        raise ValueError(f"{name}({value}): expected a number above 0")
-    return float(value)
+    return float(positive(name, value, "it counts standard deviations or degrees of freedom"))

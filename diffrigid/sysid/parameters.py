@@ -97,7 +97,9 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
     shared: list[Slot] = []
     own: list[Slot] = []
     for key, kind in free.items():
-        names = (key,) if isinstance(key, str) else tuple(key)
+        names = (key,) if isinstance(key, str) else tuple(key) if isinstance(key, tuple | list) else ()
+        if not names or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"free has the key {key!r}: expected a path such as 'ball.mass', or a tuple of paths")
         several = isinstance(kind, Each)
         kind = kind.kind if isinstance(kind, Each) else kind
         known = kind if isinstance(kind, Prior) else None
@@ -110,7 +112,12 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
         if not having or several and len(having) < len(scenes):
             _refuse(names, having, scenes)
         slot = Slot(" = ".join(names), names, kind, 0, known)
-        size = kind.size(reference(slot, having[0]).shape)
+        shape = reference(slot, having[0]).shape
+        size = kind.size(shape)
+        if known is not None and len(known.mean) not in (1, int(np.prod(shape))):
+            raise ValueError(
+                f"free[{key!r}]: a prior with {len(known.mean)} means, expected those of the shape {shape}"
+            )
         name = slot.name.replace(" = ", " : ") if slot.joint else slot.name
         (own if several else shared).append(Slot(name, names, kind, size, known))
     return tuple(shared), tuple(own)

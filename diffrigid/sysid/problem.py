@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid import paths
+from diffrigid.convert import positive
 from diffrigid.step import aligned, scan_steps
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
@@ -68,9 +69,7 @@ def make_groups(found: Sequence[Run], slots: Sequence[Slot], shared: int, dt: fl
         dt: [s] longest step; default the median of the intervals between times.
     """
     gaps = np.concatenate([np.diff(_all_times(run)) for run in found])
-    if dt is not None and not dt > 0:
-        raise ValueError(f"dt is {dt}, expected > 0 [s]")
-    longest = float(np.median(gaps)) if dt is None else float(dt)
+    longest = float(np.median(gaps)) if dt is None else float(positive("dt", dt, "it is the longest step in s"))
     keys: dict[Any, list[int]] = {}
     for index, run in enumerate(found):
         scene = (run.world, run.state, run.channels)

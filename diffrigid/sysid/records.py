@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from diffrigid.convert import known_number
 from diffrigid.state import State
 from diffrigid.sysid.sensors import Channel, Part, channel_of
 from diffrigid.world import World, check
@@ -66,6 +67,7 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
         ValueError: unknown names, wrong shapes, times that do not increase, a column without any number.
     """
     check(world, state)
+    check_mapping("noise", noise)
     several = isinstance(observations, list | tuple)
     records = [r if isinstance(r, Record) else Record(r) for r in (observations if several else [observations])]
     if not records:
@@ -73,7 +75,9 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
     found = []
     for index, record in enumerate(records):
         where = f"observations[{index}]" if several else "observations"
-        own_world, own_state = record.world or world, record.state or state
+        own_world = world if record.world is None else record.world
+        own_state = state if record.state is None else record.state
+        check_mapping(f"{where}.noise", record.noise)
         check(own_world, own_state)
         series, channels = columns(own_world, record.observations, observe, where)
         names = [s.name for s in series]
@@ -81,7 +85,7 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
             raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
         given = {name: sigma for name, sigma in (noise or {}).items() if name in names} | dict(record.noise or {})
         first = min(float(s.t[0]) for s in series)
-        start = first if record.start is None else float(record.start)
+        start = first if record.start is None else float(known_number(f"{where}.start", record.start))
         if start > first:
             raise ValueError(
                 f"{where}: start is {start:g} s, after the first measured time {first:g} s: make it earlier"
@@ -115,6 +119,9 @@ def columns(
         observe: what a column observes if it is not named for that.
     """
     table = _table(observations, where)
+    check_mapping("observe", observe)
+    if odd := [name for name in table if not isinstance(name, str)]:
+        raise ValueError(f"{where} has a column {odd[0]!r}: expected names of columns, such as 'ball.x'")
     shared = None if "t" not in table else _times(table.pop("t"), f'{where}["t"]')
     gathered = _gather(table)
     found, channels = [], {}
@@ -139,8 +146,13 @@ def columns(
 
 def read_csv(path: str | Path) -> dict[str, np.ndarray]:
     """Columns of a file with one line of names; an empty cell is missing."""
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} is no CSV file: {error}") from None
+    if not rows:
+        raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
     names, body = [name.strip() for name in rows[0]], rows[1:]
     for number, row in enumerate(body, start=2):
         if len(row) != len(names):
@@ -165,16 +177,35 @@ def _table(observations: Any, where: str) -> dict[str, Any]:
 
 
 def _times(t: Any, where: str) -> np.ndarray:
-    t = np.asarray(t, float)
+    t = _floats(t, where)
     if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all():
         raise ValueError(f"{where}: expected at least two increasing times, without NaN")
     return t
+
+
+def _floats(values: Any, where: str) -> np.ndarray:
+    """A column as floats; masked values of a table are missing."""
+    try:
+        array: np.ndarray = np.asarray(np.ma.filled(np.ma.asarray(values, float), np.nan))
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{where} is {values!r:.80}: expected numbers, NaN where missing") from None
+    if np.isinf(array).any():
+        raise ValueError(f"{where} has infinite values: expected numbers, NaN where missing")
+    return array
+
+
+def check_mapping(where: str, value: Any) -> None:
+    """Raise ValueError for what is neither a dict by column nor None."""
+    if value is not None and not isinstance(value, Mapping):
+        raise ValueError(f"{where} is {value!r:.80}: expected a dict by name of column")
 
 
 def _gather(table: Mapping[str, Any]) -> dict[str, Any]:
     """Components "ball.x[0]", "ball.x[1]" put together under "ball.x", as {component: values}."""
     out: dict[str, Any] = {}
     for name, values in table.items():
+        if isinstance(values, Mapping):
+            raise ValueError(f"observations[{name!r}] is a dict: expected an array, or a pair (t, values)")
         if match := re.fullmatch(r"(.+)\[(\d+)\]", name):
             parts = out.setdefault(match[1], {})
             if not isinstance(parts, dict):
@@ -194,12 +225,12 @@ def _filled(values: Any, rows: int, size: int, where: str, world: World) -> np.n
             raise ValueError(f"{where}: component [{bad[0]}] of {size} in this {world.dim}D world")
         whole = np.full((rows, size), np.nan)
         for index, part in values.items():
-            part = np.asarray(part, float)
+            part = _floats(part, f"{where}[{index}]")
             if part.shape != (rows,):
                 raise ValueError(f"{where}[{index}] has shape {part.shape}, expected ({rows},) like t")
             whole[:, index] = part
         return whole
-    values = np.asarray(values, float)
+    values = _floats(values, where)
     values = values[:, None] if values.ndim == 1 else values
     if values.shape != (rows, size):
         raise ValueError(

@@ -17,18 +17,21 @@ import numpy as np
 
 from diffrigid import paths
 from diffrigid.state import State
+from diffrigid.step import at_least_one
 from diffrigid.sysid.records import Record, Series, columns
 from diffrigid.sysid.sensors import Part
-from diffrigid.world import World
+from diffrigid.world import World, check
 
 FRAMES = 5  # rows of a column that a guess of its start is made from
 
 
 def segments(world: World, state: State, observations: Any, count: int) -> list[Record]:
     """Pieces of equal duration, with initial states guessed from the first rows of their "x" and "angle" columns."""
-    if count < 1:
-        raise ValueError(f"segments: count is {count}, expected an integer >= 1")
+    check(world, state)
+    at_least_one("count", count)
     series, channels = columns(world, observations, {})
+    if count > max(len(s.t) for s in series):
+        raise ValueError(f"count is {count}: expected at most as many segments as there are times")
     first, last = min(s.t[0] for s in series), max(s.t[-1] for s in series)
     edges = np.linspace(first, last, count + 1)
     out = []

@@ -143,7 +143,10 @@ def channel_of(name: str, what: Any, world: World) -> Channel:
     channel = what if isinstance(what, Channel) else Channel(observer=what)
     sizes = {"D": world.dim, "Q": 2 if world.dim == 2 else 4, "H": 3, "P": 2}
     observer = map_arrays(partial(_fill, sizes), _resolved(name, channel.observer, world), name)
-    sizes["M"] = size_of(observer, world)
+    try:
+        sizes["M"] = size_of(observer, world)
+    except (TypeError, AttributeError, LookupError) as error:
+        raise ValueError(f"observe[{name!r}] fails for a state of this world: {error}") from error
     return map_arrays(partial(_fill, sizes), replace(channel, observer=observer), name)
 
 
@@ -178,7 +181,7 @@ def _resolved(name: str, what: Any, world: World) -> Any:
                 + f": {nearest(what, possible)} Say what other columns observe by observe={{{name!r}: ...}}."
             )
         return Part(body=world.names.index(body), field=field)
-    if not hasattr(what, "__dataclass_fields__"):
+    if not callable(what) or not hasattr(what, "__dataclass_fields__"):
         if not callable(what):
             raise ValueError(f"observe[{name!r}] is {what!r}: expected 'ball.x', Marker(body='ball'), or a function")
         return Function(fn=what)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.convert import numbers
 from diffrigid.state import State
 from diffrigid.step import floats
 from diffrigid.sysid.covariance import Linear
@@ -95,7 +96,7 @@ def _weights(run: Run, name: str, noise: Mapping[str, float], window: float, row
     """1 / standard deviation, (rows, size), 0 where missing, beyond the window, or padded."""
     here = known(run, name)
     series = next(s for s in run.series if s.name == name)
-    sigma = np.asarray(run.noise.get(name, noise.get(name, 1.0)), float)
+    sigma = np.asarray(numbers(f"noise[{name!r}]", run.noise.get(name, noise.get(name, 1.0)), None, finite=False))
     sigma = sigma[:, None] if sigma.ndim == 1 and len(sigma) == len(here) else sigma
     try:
         sigma = np.broadcast_to(sigma, here.shape)

@@ -63,8 +63,9 @@ class Summary:
 
 def load_fit(path: str | Path) -> Summary:
     """What `save` wrote: the table, and with `fit(..., resume=...)` where to go on from."""
-    data = json.loads(Path(path).read_text(encoding="utf-8"))
+    content = Path(path).read_bytes()
     try:
+        data = json.loads(content)
         parameters = tuple(
             Parameter(**{**p, **{key: np.asarray(p[key], float) for key in ("value", "low", "high")}})
             for p in data.pop("parameters")
@@ -72,7 +73,7 @@ def load_fit(path: str | Path) -> Summary:
         return Summary(
             parameters=parameters, costs=np.asarray(data.pop("costs"), float), notes=tuple(data.pop("notes")), **data
         )
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{path} is not a saved fit: {error}") from error
 
 

@@ -1,0 +1,199 @@
+"""Links, as files of robots have them, and the scene that they make.
+
+A link has a frame of its own; mass, shapes and the joint to its parent are given in it. A `Body` has its axes in its
+centre of mass, and as its shape has them.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from diffrigid import joints
+from diffrigid.contact import Contact
+from diffrigid.models.frames import Frame, to_quaternion
+from diffrigid.scene import RESERVED, Body, Static, scene
+from diffrigid.shapes import HalfSpace
+from diffrigid.state import State
+from diffrigid.world import World
+
+CENTRED = 1e-6  # [-] of its size by which a shape may be off the centre of mass
+HALF_TURN = np.pi * (1 + 1e-9)  # [rad] angles of hinges are between -pi and pi
+
+
+@dataclass(frozen=True)
+class Mass:
+    """Mass [kg], its centre (3,) [m] and inertia (3, 3) [kg m^2] about that, in the axes of a link."""
+
+    mass: float
+    center: np.ndarray
+    inertia: np.ndarray
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A shape on a link; `shape` is None for a kind that does not collide here."""
+
+    name: str
+    shape: Any
+    frame: Frame
+    friction: float = 0.0
+    bits: tuple[int, int] = (1, 1)  # two collide if the first of one and the second of the other have one in common
+
+
+@dataclass(frozen=True)
+class Joint:
+    """kind: "hinge", "slide", "ball", "weld" or "free"; point and axis in the frame of the link."""
+
+    kind: str
+    name: str = ""
+    point: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    axis: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    lower: float | None = None
+    upper: float | None = None
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid part: where it is at the start, and what it is joined to (None: the world)."""
+
+    name: str
+    frame: Frame
+    parent: str | None
+    joint: Joint
+    mass: Mass | None
+    geometry: tuple[Geometry, ...] = ()
+    still: bool = False  # does not move
+
+
+def total(parts: Sequence[Mass]) -> Mass:
+    """Several masses as one, by the parallel axis theorem."""
+    mass = sum(part.mass for part in parts)
+    center = sum((part.mass * part.center for part in parts), np.zeros(3)) / mass
+    inertia = np.zeros((3, 3))
+    for part in parts:
+        r = part.center - center
+        inertia += part.inertia + part.mass * (r @ r * np.eye(3) - np.outer(r, r))
+    return Mass(mass, center, inertia)
+
+
+def turned(inertia: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """R I R^T, symmetric to rounding."""
+    out = R @ inertia @ R.T
+    return 0.5 * (out + out.T)
+
+
+def assemble(
+    where: str,
+    links: Sequence[Link],
+    left_out: Sequence[str],
+    apart: Sequence[tuple[str, str]],
+    gravity: Any,
+    restitution: Any,
+    contact: Contact | None,
+) -> tuple[World, State]:
+    """The scene of these links.
+
+    Args:
+        where: the file, for messages. left_out: what of it has no counterpart; one warning names all.
+        apart: pairs of links that pass through each other.
+    """
+    skipped = list(left_out)
+    bodies: dict[str, Any] = {}
+    shapes: dict[str, tuple[str, Geometry]] = {}  # of each collider: its link and its shape
+    frames: dict[str, Frame] = {}
+    for link in links:
+        if link.still:
+            for geometry in link.geometry:
+                if geometry.shape is None:
+                    continue
+                placed = link.frame @ geometry.frame
+                bodies[geometry.name] = Static(
+                    geometry.shape, x=placed.x, q=to_quaternion(placed.R), friction=geometry.friction
+                )
+                shapes[geometry.name] = link.name, geometry
+        else:
+            bodies[link.name], frames[link.name], chosen = _body(where, link, skipped)
+            if chosen is not None:
+                shapes[link.name] = link.name, chosen
+    made: dict[str, Any] = {}
+    for link in links:
+        if not link.still and link.joint.kind != "free":
+            name = free_name(link.joint.name or f"{link.name}_joint", {*bodies, *made}, "_joint")
+            made[name] = _joint(link, frames, skipped)
+    if skipped:
+        warnings.warn(f"{where}: left out: {'; '.join(dict.fromkeys(skipped))}.", stacklevel=3)
+    return scene(
+        bodies, gravity=gravity, restitution=restitution, contact=contact, joints=made,
+        ignore=_ignored(shapes, set(map(frozenset, apart))),
+    )  # fmt: skip
+
+
+def free_name(name: str, taken: Any, suffix: str) -> str:
+    """A name that `scene` takes: no dots, not reserved, not taken."""
+    name = name.replace(".", "_") or suffix.strip("_")
+    while name in taken or name in (*RESERVED, "gravity"):
+        name += suffix
+    return name
+
+
+def _body(where: str, link: Link, skipped: list[str]) -> tuple[Body, Frame, Geometry | None]:
+    """A moving link as a body, its axes in the world, and the shape that it collides with."""
+    if link.mass is None or not link.mass.mass > 0:
+        raise ValueError(f"{where}: {link.name!r} moves and has no mass: give it an inertial, or fix it.")
+    mass, chosen = link.mass, None
+    for geometry in link.geometry:
+        if geometry.shape is None or not any(geometry.bits):
+            continue
+        size = max(float(np.linalg.norm(geometry.frame.x)), float(np.sqrt(np.trace(mass.inertia) / mass.mass)))
+        if isinstance(geometry.shape, HalfSpace):
+            skipped.append(f"{geometry.name}, a plane that moves")
+        elif np.linalg.norm(geometry.frame.x - mass.center) > CENTRED * size:
+            skipped.append(f"{geometry.name}, which is off the centre of mass of {link.name} and does not collide here")
+        elif chosen is not None:
+            skipped.append(f"{geometry.name}, the second shape of {link.name}")
+        else:
+            chosen = geometry
+    R = np.eye(3) if chosen is None else chosen.frame.R
+    axes = link.frame @ Frame(mass.center, R)
+    body = Body(
+        None if chosen is None else chosen.shape, mass=mass.mass, inertia=turned(mass.inertia, R.T), x=axes.x,
+        q=to_quaternion(axes.R), friction=None if chosen is None else chosen.friction,
+    )  # fmt: skip
+    return body, axes, chosen
+
+
+def _joint(link: Link, frames: dict[str, Frame], skipped: list[str]) -> Any:
+    """The joint of a link to its parent, the world where that does not move."""
+    joint, axes = link.joint, frames[link.name]
+    parent = link.parent if link.parent in frames else None
+    point, axis = link.frame.x + link.frame.R @ joint.point, link.frame.R @ joint.axis
+    ends: dict[str, Any] = {"a": link.name, "b": parent, "anchor_a": axes.R.T @ (point - axes.x)}
+    if joint.kind in ("ball", "weld"):
+        return (joints.Ball if joint.kind == "ball" else joints.Weld)(**ends)
+    drive: dict[str, Any] = {name: value for name in ("damping", "friction") if (value := getattr(joint, name)) > 0}
+    limits = {"lower": joint.lower, "upper": joint.upper}
+    for side, value in limits.items():
+        if value is not None and joint.kind == "hinge" and abs(value) > HALF_TURN:
+            skipped.append(f"{side} limit {value:g} rad of {joint.name or link.name}, beyond half a turn")
+        elif value is not None:
+            drive[side] = value
+    if joint.kind == "hinge":
+        return joints.Revolute(**ends, **drive, axis_a=axes.R.T @ axis)
+    return joints.Prismatic(**ends, **drive, axis_b=axis if parent is None else frames[parent].R.T @ axis)
+
+
+def _ignored(shapes: dict[str, tuple[str, Geometry]], apart: set[frozenset[str]]) -> list[tuple[str, str]]:
+    """Pairs of colliders that pass through each other."""
+    names, out = list(shapes), []
+    for i, first in enumerate(names):
+        for second in names[:i]:
+            (link_a, a), (link_b, b) = shapes[first], shapes[second]
+            meet = a.bits[0] & b.bits[1] or b.bits[0] & a.bits[1]
+            if not meet or frozenset((link_a, link_b)) in apart:
+                out.append((first, second))
+    return out

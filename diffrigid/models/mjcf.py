@@ -1,0 +1,284 @@
+"""MJCF, the files of MuJoCo: bodies, primitive geoms, inertials, joints and default classes."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from diffrigid.contact import Contact
+from diffrigid.models.frames import Frame, about, from_axes, from_euler, from_quaternion, onto
+from diffrigid.models.geoms import geometry_of, mass_of
+from diffrigid.models.links import Geometry, Joint, Link, Mass, assemble, free_name, total
+from diffrigid.models.xml import Reader, read_xml
+from diffrigid.state import State
+from diffrigid.world import World
+
+LOOKS = ("rgba", "material", "group")  # attributes that change no motion
+QUIET = ("asset", "visual", "statistic", "size", "custom", "sensor", "worldbody", "default", "compiler", "option")
+SEEN = ("light", "camera", "site")  # elements of bodies that change no motion
+BREAKING = ("frame", "replicate", "composite", "flexcomp", "attach", "plugin")  # without which the rest is wrong
+KINDS = ("hinge", "slide", "ball", "free")
+
+
+@dataclass
+class Model:
+    """What the whole file says, and what has been found of it."""
+
+    where: str
+    degrees: bool
+    sequence: str
+    limited: bool  # a range is a limit
+    from_geoms: str  # "auto", "true" or "false": masses
+    classes: dict[str, dict[str, dict[str, str]]]
+    links: list[Link] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    names: set[str] = field(default_factory=set)
+
+    def reader(self, element: ElementTree.Element, scope: str) -> Reader:
+        """The attributes of an element and those of its class."""
+        name = element.get("class", scope)
+        if name not in self.classes:
+            raise ValueError(f"{self.where}: <{element.tag}> has the class {name!r}, which is not in <default>.")
+        return Reader(self.where, element.tag, {**self.classes[name].get(element.tag, {}), **element.attrib})
+
+    def name_of(self, element: ElementTree.Element, default: str) -> str:
+        """The name of a body or geom, or one that is free."""
+        name = free_name(element.get("name", default), self.names, "_")
+        self.names.add(name)
+        return name
+
+
+def load_mjcf(path: str | Path, *, restitution: Any = 0.0, contact: Contact | None = None) -> tuple[World, State]:
+    """World and state at the start of a MuJoCo file.
+
+    Every body becomes a `Body` of its name, with its axes in the centre of mass and along those of its geom; geoms of
+    the world become statics. Bodies without a joint are welded to their parent. A contact takes the mean of the two
+    sliding frictions, where MuJoCo takes the larger one.
+
+    Args:
+        restitution: [-] of all bodies; MuJoCo has none. contact: as in `scene`.
+
+    Raises:
+        ValueError: names the element and the attribute that cannot be read.
+
+    Warns:
+        UserWarning: names all that is left out: meshes, cylinders and ellipsoids do not collide, a body collides with
+            one geom that is centred at its centre of mass; actuators, tendons, springs of joints, armature.
+    """
+    where, root = str(path), read_xml(path, "mujoco")
+    _include(root, Path(path).parent, (Path(path).resolve(),))
+    compiler = _merged(where, root, "compiler")
+    angle, mode = compiler.text("angle", "degree"), compiler.text("inertiafromgeom", "auto")
+    if compiler.text("coordinate", "local") != "local":
+        raise ValueError(f"{where}: <compiler coordinate='global'> cannot be loaded: expected local coordinates.")
+    model = Model(
+        where, angle == "degree", str(compiler.text("eulerseq", "xyz")), compiler.text("autolimits") != "false",
+        str(mode), _classes(where, root),
+    )  # fmt: skip
+    option = _merged(where, root, "option")
+    gravity = option.numbers("gravity", 3, (0.0, 0.0, -9.81))
+    model.left_out += compiler.left_out("meshdir", "texturedir", "assetdir", "discardvisual", "strippath", "usethread")
+    model.left_out += option.left_out()
+    for world in root.findall("worldbody"):
+        _children(model, world, Link("world", Frame(), None, Joint("weld"), None, still=True), "main")
+    apart = []
+    for element in root:
+        if element.tag == "contact":
+            apart += [(e.get("body1", ""), e.get("body2", "")) for e in element.findall("exclude")]
+            model.left_out += [f"contact {e.tag}" for e in element if e.tag != "exclude"]
+        elif element.tag not in QUIET and len(element):
+            model.left_out.append(f"{element.tag} ({', '.join(sorted({e.tag for e in element}))})")
+    return assemble(where, model.links, model.left_out, apart, gravity, restitution, contact)
+
+
+def _include(root: ElementTree.Element, folder: Path, parents: tuple[Path, ...]) -> None:
+    """Put in the place of each <include> what its file holds."""
+    for parent in list(root.iter()):
+        for place, element in reversed(list(enumerate(parent))):
+            if element.tag == "include":
+                path = (folder / element.get("file", "")).resolve()
+                if path in parents:
+                    raise ValueError(f"{path} includes itself.")
+                inner = read_xml(path, ElementTree.parse(path).getroot().tag)
+                _include(inner, folder, (*parents, path))
+                parent.remove(element)
+                for child in reversed(inner):
+                    parent.insert(place, child)
+
+
+def _merged(where: str, root: ElementTree.Element, tag: str) -> Reader:
+    """All elements of a section as one; later ones win."""
+    return Reader(where, tag, {k: v for element in root.findall(tag) for k, v in element.attrib.items()})
+
+
+def _classes(where: str, root: ElementTree.Element) -> dict[str, dict[str, dict[str, str]]]:
+    """Attributes by class and element; a class has those of the class around it."""
+    classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+
+    def walk(element: ElementTree.Element, outer: dict[str, dict[str, str]], default: str | None) -> None:
+        name = element.get("class", default)
+        if name is None:
+            raise ValueError(f"{where}: a <default> in another has no class: expected a name.")
+        own = {tag: dict(attributes) for tag, attributes in classes.get(name, outer).items()}
+        for child in element:
+            if child.tag != "default":
+                own[child.tag] = {**own.get(child.tag, {}), **child.attrib}
+        classes[name] = own
+        for child in element.findall("default"):
+            walk(child, own, None)
+
+    for element in root.findall("default"):
+        walk(element, {}, "main")
+        classes["main"] = classes[element.get("class", "main")]
+    return classes
+
+
+# ---- bodies
+
+
+def _children(model: Model, element: ElementTree.Element, parent: Link, scope: str) -> None:
+    """Read the geoms of the world, or the bodies in a body."""
+    scope = element.get("childclass", scope)
+    if odd := [child.tag for child in element if child.tag in BREAKING]:
+        raise ValueError(f"{model.where}: <{odd[0]}> in {parent.name!r} cannot be loaded: write it out as bodies.")
+    if parent.name == "world":
+        geometry = tuple(_geoms(model, element, "world", scope)[0])
+        model.links.append(Link("world", Frame(), None, Joint("weld"), None, geometry, still=True))
+    for child in element.findall("body"):
+        _body(model, child, parent, scope)
+
+
+def _body(model: Model, element: ElementTree.Element, parent: Link, scope: str) -> None:
+    inner = element.get("childclass", scope)
+    name = model.name_of(element, f"body{len(model.links)}")
+    reader = Reader(model.where, "body", dict(element.attrib))
+    frame = parent.frame @ Frame(reader.numbers("pos", 3, np.zeros(3)), _rotation(model, reader))
+    joint = _joint(model, element, name, parent, inner)
+    geometry, masses = _geoms(model, element, name, inner)
+    still = joint.kind == "weld" and parent.still
+    link = Link(name, frame, parent.name, joint, _mass(model, element, name, masses), tuple(geometry), still)
+    model.links.append(link)
+    model.left_out += reader.left_out("childclass", "user")
+    known = (*SEEN, "geom", "joint", "freejoint", "inertial", "body", *BREAKING)
+    model.left_out += [f"{child.tag} of body {name!r}" for child in element if child.tag not in known]
+    _children(model, element, link, scope)
+
+
+def _rotation(model: Model, reader: Reader) -> np.ndarray:
+    """R of quat, axisangle, euler, xyaxes or zaxis."""
+    scale = np.pi / 180.0 if model.degrees else 1.0
+    given = [name for name in ("quat", "axisangle", "euler", "xyaxes", "zaxis") if reader.given(name)]
+    if len(given) > 1:
+        raise ValueError(f"{reader.where} has {given[0]} and {given[1]}: expected one orientation.")
+    match given:
+        case ["quat"]:
+            return from_quaternion(_direction(reader, "quat", 4))
+        case ["axisangle"]:
+            *axis, angle = reader.numbers("axisangle", 4)
+            return about(np.array(axis), scale * angle)
+        case ["euler"]:
+            return from_euler(scale * reader.numbers("euler", 3), model.sequence)
+        case ["xyaxes"]:
+            axes = reader.numbers("xyaxes", 6)
+            return from_axes(axes[:3], axes[3:])
+        case ["zaxis"]:
+            return onto(_direction(reader, "zaxis", 3))
+    return np.eye(3)
+
+
+def _direction(reader: Reader, name: str, count: int, default: Any = None) -> np.ndarray:
+    values = reader.numbers(name, count, default)
+    if not values.any():
+        raise ValueError(f"{reader.where}: {name} is zero: expected a direction.")
+    return values
+
+
+def _mass(model: Model, element: ElementTree.Element, name: str, masses: list[Mass]) -> Mass | None:
+    """Of <inertial>, or the sum over the geoms."""
+    inertial = element.find("inertial")
+    if inertial is None or model.from_geoms == "true":
+        return total(masses) if masses and model.from_geoms != "false" else None
+    reader = Reader(model.where, f"inertial of {name}", dict(inertial.attrib))
+    R = _rotation(model, reader)
+    if reader.given("fullinertia"):
+        xx, yy, zz, xy, xz, yz = reader.numbers("fullinertia", 6)
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    else:
+        inertia = R @ np.diag(reader.numbers("diaginertia", 3)) @ R.T
+    return Mass(reader.number("mass"), reader.numbers("pos", 3), inertia)
+
+
+def _geoms(model: Model, element: ElementTree.Element, body: str, scope: str) -> tuple[list[Geometry], list[Mass]]:
+    """Shapes and masses of the geoms of a body."""
+    shapes, masses = [], []
+    for index, geom in enumerate(element.findall("geom")):
+        reader = model.reader(geom, scope)
+        name = model.name_of(geom, f"{body}_geom{index}")
+        bits = int(reader.number("contype", 1)), int(reader.number("conaffinity", 1))
+        made = geometry_of(reader, _rotation(model, reader))
+        rub = reader.some("friction")[0] if reader.given("friction") else 1.0
+        shapes.append(Geometry(name, made.shape, made.frame, float(rub), bits))
+        if made.shape is None and any(bits):
+            model.left_out.append(f"contacts of {reader.label or name}, a {made.kind}")
+        if body != "world" and (mass := mass_of(reader, made)) is not None:
+            masses.append(mass)
+        model.left_out += reader.left_out(*LOOKS, "density", "mass")
+    return shapes, masses
+
+
+def _joint(model: Model, element: ElementTree.Element, name: str, parent: Link, scope: str) -> Joint:
+    """The one joint of a body."""
+    found = [child for child in element if child.tag in ("joint", "freejoint")]
+    if not found:
+        return Joint("weld")
+    if len(found) > 1:
+        raise ValueError(
+            f"{model.where}: body {name!r} has {len(found)} joints: expected one; put a body with a small mass between "
+            "each two, or a ball for three hinges in one point."
+        )
+    if found[0].tag == "freejoint":
+        kind, reader = "free", Reader(model.where, "freejoint", dict(found[0].attrib))
+    else:
+        reader = model.reader(found[0], scope)
+        kind = str(reader.text("type", "hinge"))
+    if kind not in KINDS:
+        raise ValueError(f"{reader.where}: type is {kind!r}: expected one of {', '.join(KINDS)}.")
+    if kind == "free" and parent.name != "world":
+        raise ValueError(f"{reader.where} is free, but {name!r} is in {parent.name!r}: expected it in <worldbody>.")
+    joint = _driven(model, reader, kind) if kind in ("hinge", "slide") else Joint(
+        kind, str(reader.text("name", "")), reader.numbers("pos", 3, np.zeros(3))
+    )  # fmt: skip
+    unimportant = (
+        *LOOKS,
+        "user",
+        "limited",
+        "actuatorfrclimited",
+        "springref",
+        "ref",
+        *(("axis",) if kind in ("ball", "free") else ()),
+    )
+    model.left_out += [text for text in reader.left_out(*unimportant) if not _is_zero(reader, text)]
+    return joint
+
+
+def _driven(model: Model, reader: Reader, kind: str) -> Joint:
+    """A hinge or a slider, with its limits counted from where it is at the start."""
+    scale = np.pi / 180.0 if model.degrees and kind == "hinge" else 1.0
+    lower = upper = None
+    limited = reader.text("limited", "auto")
+    if limited == "true" or limited == "auto" and model.limited and reader.given("range"):
+        lower, upper = (float(s) for s in scale * (reader.numbers("range", 2) - reader.number("ref", 0.0)))
+    reader.text("range")
+    return Joint(
+        kind, str(reader.text("name", "")), reader.numbers("pos", 3, np.zeros(3)),
+        _direction(reader, "axis", 3, (0.0, 0.0, 1.0)), lower, upper,
+        float(reader.some("damping")[0]) if reader.given("damping") else 0.0, reader.number("frictionloss", 0.0),
+    )  # fmt: skip
+
+
+def _is_zero(reader: Reader, text: str) -> bool:
+    """Whether what is left out is a 0 that changes nothing."""
+    value = reader.attributes[text.split(" of ")[0]]
+    return all(part.strip("+-0.") == "" for part in value.split())

@@ -1,0 +1,76 @@
+"""XML elements with numbers in their attributes, read with messages that name both."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+
+def read_xml(path: str | Path, root: str) -> ElementTree.Element:
+    """The root of a file.
+
+    Raises:
+        ValueError: it is no XML, or its root is called otherwise.
+    """
+    try:
+        found = ElementTree.parse(path).getroot()
+    except (ElementTree.ParseError, UnicodeDecodeError, LookupError) as error:
+        raise ValueError(f"{path} is no XML file: {error}") from None
+    if found.tag != root:
+        raise ValueError(f"{path} starts with <{found.tag}>: expected <{root}>.")
+    return found
+
+
+class Reader:
+    """The attributes of one element; those that are never asked for are left out of the scene."""
+
+    def __init__(self, where: str, tag: str, attributes: dict[str, str]):
+        self.where = f"{where}: <{tag}{_called(attributes)}>"
+        self.label = f"{tag}{_called(attributes)}"
+        self.attributes, self.asked = attributes, {"name", "class"}
+
+    def text(self, name: str, default: str | None = None) -> str | None:
+        self.asked.add(name)
+        return self.attributes.get(name, default)
+
+    def given(self, name: str) -> bool:
+        return name in self.attributes
+
+    def numbers(self, name: str, count: int, default: Iterable[float] | None = None) -> np.ndarray:
+        """`count` numbers, (count,); more are cut off only where `default` is given."""
+        text = self.text(name)
+        if text is None:
+            if default is None:
+                raise ValueError(f"{self.where} has no {name}: expected {_amount(count)}.")
+            return np.array(list(default), float)
+        values = self.some(name)
+        if len(values) != count:
+            raise ValueError(f"{self.where}: {name} is {text!r}: expected {_amount(count)}.")
+        return values
+
+    def some(self, name: str) -> np.ndarray:
+        """All numbers of an attribute, at least one."""
+        text = self.text(name) or ""
+        try:
+            values = np.array([float(part) for part in text.split()])
+        except ValueError:
+            values = np.zeros(0)
+        if not len(values) or not np.isfinite(values).all():
+            raise ValueError(f"{self.where}: {name} is {text!r}: expected finite numbers.")
+        return values
+
+    def number(self, name: str, default: float | None = None) -> float:
+        return float(self.numbers(name, 1, None if default is None else [default])[0])
+
+    def left_out(self, *ignored: str) -> list[str]:
+        """Attributes that nobody asked for, but for those that change no motion."""
+        return [f"{name} of {self.label}" for name in self.attributes if name not in {*self.asked, *ignored}]
+
+
+def _called(attributes: dict[str, str]) -> str:
+    return f" {attributes['name']!r}" if "name" in attributes else ""
+
+
+def _amount(count: int) -> str:
+    return "a number" if count == 1 else f"{count} numbers"
