@@ -12,6 +12,8 @@ which is Newton's law at a slightly larger distance: it keeps momentum, makes no
 (gap_min far below zero) as they are, and lets a near miss pull.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
