@@ -10,7 +10,7 @@ from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.pytree import replace
 from diffrigid.scene import Body, Static, scene
-from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Sphere
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Profile, Sphere
 from diffrigid.state import (
     State,
     Wrench,
@@ -70,6 +70,7 @@ __all__ = [
     "Pinhole",
     "Player",
     "Polygon",
+    "Profile",
     "Prismatic",
     "Record",
     "Revolute",
