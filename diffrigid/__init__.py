@@ -11,7 +11,7 @@ from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.models import load_mjcf, load_urdf
 from diffrigid.pytree import replace
 from diffrigid.scene import Body, Static, scene
-from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Sphere
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Profile, Sphere
 from diffrigid.state import (
     State,
     Wrench,
@@ -71,6 +71,7 @@ __all__ = [
     "Pinhole",
     "Player",
     "Polygon",
+    "Profile",
     "Prismatic",
     "Record",
     "Revolute",

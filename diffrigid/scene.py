@@ -30,7 +30,7 @@ from diffrigid.joint_checks import joints_of, warn_of_torn_joints
 from diffrigid.overlap import overlapping, place
 from diffrigid.pytree import map_arrays, refuse_missing
 from diffrigid.shape_checks import check_shape
-from diffrigid.shapes import HalfSpace, Hull, Polygon, Shape, dimension, traced
+from diffrigid.shapes import BOUNDLESS, Hull, Polygon, Profile, Shape, dimension, traced
 from diffrigid.state import COEFFICIENTS, Bodies, State
 from diffrigid.world import Offset, Statics, World
 
@@ -168,8 +168,8 @@ def _sorted(bodies: Mapping[str, Body | Static]) -> tuple[dict[str, Body], dict[
             raise ValueError(f"bodies: {name!r} is no name: expected a string, no path, no dots; rename it.")
         if isinstance(body, Static) and body.shape is None:
             raise ValueError(f"{name}.shape is None: expected a shape; leave out a Static without one.")
-        if isinstance(body, Body) and isinstance(body.shape, HalfSpace):
-            raise ValueError(f"{name}.shape is a HalfSpace, which has no mass: make {name} a Static.")
+        if isinstance(body, Body) and isinstance(body.shape, BOUNDLESS):
+            raise ValueError(f"{name}.shape is a {type(body.shape).__name__}, which has no mass: make {name} a Static.")
         if isinstance(body, Body) and body.x is None:
             raise ValueError(f"{name}.x is missing: expected the centre of mass, (2,) or (3,) [m]; give x.")
         if body.shape is not None:
@@ -291,13 +291,13 @@ def _contact(contact: Any) -> Contact:
 
 
 def _warn_of_overlap(world: World, state: State, shapes: Mapping, solids: Mapping) -> None:
-    """Warn of pairs that penetrate at the start; those with a value that is traced are left out."""
+    """Warn of pairs that penetrate at the start; those with a profile or a value that is traced are left out."""
     poses = [*zip(state.x, state.q, strict=True), *zip(world.statics.x, world.statics.q, strict=True)]
     placed = {}
     for index, ((name, shape), (x, q)) in enumerate(zip(shapes.items(), poses, strict=True)):
         solid = solids.get(name)
         center = np.zeros(world.dim) if solid is None else solid.center
-        if shape is not None and not traced((shape, center, x, q)):
+        if shape is not None and not isinstance(shape, Profile) and not traced((shape, center, x, q)):
             placed[index] = place(shape, x, q, center)
     pairs = [pair for group in world.pairs for pair in zip(group.a, group.b, strict=True)]
     if deep := overlapping(placed, pairs, OVERLAP):

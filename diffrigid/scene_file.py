@@ -48,8 +48,7 @@ KINDS: dict[str, Callable] = {
     for name in ("interval", "positive", "real", "direction", "rotation", "inertia", "shares")
 }
 SHAPES = {"half_space": shapes.HalfSpace} | {
-    kind.__name__.lower(): kind
-    for kind in (shapes.Disc, shapes.Sphere, shapes.Box, shapes.Capsule, shapes.Polygon, shapes.Hull)
+    kind.__name__.lower(): kind for kind in shapes.SHAPES if kind is not shapes.HalfSpace
 }
 FORCES = {"spring": forces.SpringDamper} | {
     kind.__name__.lower(): kind for kind in (forces.Drag, forces.Force, forces.Torque)

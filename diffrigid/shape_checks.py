@@ -15,6 +15,7 @@ from diffrigid.shapes import (
     HalfSpace,
     Hull,
     Polygon,
+    Profile,
     Shape,
     Sphere,
     dimension,
@@ -104,6 +105,11 @@ def _normal_problem(value):
         return f"has length {length:.9g}: expected a unit vector; divide it (and the offset) by its length."
 
 
+def _profile_problem(value):
+    if (n := first(np.diff(value[:, 0]) <= FLAT * extent(value))) is not None:
+        return f"does not go to the right from point {n}: sort them by x; a steep step needs two different x."
+
+
 def _polygon_problem(value):
     side = np.roll(value, -1, axis=0) - value
     if (n := first(np.linalg.norm(side, axis=1) <= FLAT * extent(value))) is not None:
@@ -129,4 +135,5 @@ _RULES = {  # text of what is wrong with a concrete leaf, None if nothing is
     (Polygon, "vertices"): _polygon_problem,
     (Hull, "vertices"): hull_problem,
     (HalfSpace, "normal"): _normal_problem,
+    (Profile, "points"): _profile_problem,
 }

@@ -1,6 +1,6 @@
 """Shapes of bodies: dimensions, corners and edges, mass, centre of mass, inertia.
 
-All coordinates are in the shape's own axes [m]. Every shape but the half space is a core, the convex hull of
+All coordinates are in the shape's own axes [m]. Every shape but the boundless ones is a core, the convex hull of
 `vertices(shape, dim)`, rounded by `radius(shape)`; contacts see only these two.
 
 Letters: D space (2 or 3), V vertices, F faces. The float leaves are differentiable, the
@@ -81,14 +81,22 @@ class HalfSpace:
     offset: Leaf = array(default=0.0)  # (*batch) [m]
 
 
-SHAPES = (Disc, Sphere, Box, Capsule, Polygon, Hull, HalfSpace)
-Shape = Disc | Sphere | Box | Capsule | Polygon | Hull | HalfSpace
+@pytree
+class Profile:
+    """The solid below a polyline in 2D, which goes on straight beyond its ends. For bodies that do not move."""
+
+    points: Leaf = array("V", "D")  # (V, 2, *batch) [m], V >= 3, from left to right
+
+
+SHAPES = (Disc, Sphere, Box, Capsule, Polygon, Hull, HalfSpace, Profile)
+Shape = Disc | Sphere | Box | Capsule | Polygon | Hull | HalfSpace | Profile
+BOUNDLESS = (HalfSpace, Profile)  # for bodies that do not move
 
 
 def dimension(shape: Shape) -> int | None:
     """Dimension of the space a shape lives in, 2 or 3; None for a capsule, which lives in either."""
     match shape:
-        case Disc() | Polygon():
+        case Disc() | Polygon() | Profile():
             return 2
         case Sphere() | Hull():
             return 3
@@ -137,6 +145,8 @@ def radius(shape: Shape) -> Array:
             return jnp.zeros_like(floats(shape.half)[0])
         case Polygon() | Hull():
             return jnp.zeros_like(floats(shape.vertices)[0, 0])
+        case Profile():
+            return jnp.zeros_like(floats(shape.points)[0, 0])
     return jnp.zeros_like(floats(shape.offset))
 
 

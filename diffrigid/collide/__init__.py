@@ -14,8 +14,9 @@ from diffrigid.collide.contacts import Contacts
 from diffrigid.collide.convex import convex_convex
 from diffrigid.collide.halfspace import convex_halfspace, round_halfspace
 from diffrigid.collide.pairs import PairGroup, pair_groups
+from diffrigid.collide.profile import convex_profile
 from diffrigid.collide.round import round_round
-from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Sphere
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Profile, Sphere
 
 CONVEX_2D: tuple[type, ...] = (Disc, Capsule, Box, Polygon)
 CONVEX_3D: tuple[type, ...] = (Sphere, Capsule, Box, Hull)
@@ -24,6 +25,7 @@ COLLIDERS: dict[tuple[type, type], Callable[..., Contacts]] = {
     (a, b): convex_convex for shapes in (CONVEX_2D, CONVEX_3D) for a in shapes for b in shapes
 }
 COLLIDERS |= {(a, HalfSpace): convex_halfspace for a in CONVEX_2D + CONVEX_3D}
+COLLIDERS |= {(a, Profile): convex_profile for a in CONVEX_2D}
 COLLIDERS |= {(Disc, Disc): round_round, (Sphere, Sphere): round_round}
 COLLIDERS |= {(Disc, HalfSpace): round_halfspace, (Sphere, HalfSpace): round_halfspace}
 

@@ -49,12 +49,12 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
         arms: with the fields of `Arms`.
     """
     so = rotations(P.shape[1])
-    points, along = _points(arms), P[len(P) - _rows(arms) :, :1]
-    P, torque = P[:points], P[points : len(P) - _rows(arms), : so.A]
+    points, along, every = _points(arms), P[len(P) - _rows(arms) :, :1], P
+    P = P[:points]
     on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a[:points], P)], axis=1)
     on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b[:points], -P)], axis=1)
     if arms.spin is not None:
-        turn = jnp.concatenate([jnp.zeros_like(P), torque], axis=1)
+        turn = jnp.concatenate([jnp.zeros_like(P), every[points : 2 * points, : so.A]], axis=1)
         on_a, on_b = jnp.concatenate([on_a, turn]), jnp.concatenate([on_b, -turn])
     if arms.jac is not None:
         on_a, on_b = (jnp.concatenate([on, along * arms.jac[:, side]]) for side, on in enumerate((on_a, on_b)))

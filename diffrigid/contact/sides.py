@@ -12,7 +12,7 @@ from diffrigid.collide.distance import reach
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.numerics import apart, dot, norm, rows
 from diffrigid.pytree import array, pytree
-from diffrigid.shapes import HalfSpace
+from diffrigid.shapes import HalfSpace, Profile
 from diffrigid.state import rotations
 
 
@@ -125,9 +125,11 @@ def gap_rates(contacts: Contacts, at_a: Placed, at_b: Placed) -> Array:
 
 
 def reach_of(side: Side) -> Array:
-    """Radius about the centre of mass that holds the shape, (*batch) [m]; huge for a half-space."""
+    """Radius about the centre of mass that holds the shape, (*batch) [m]; huge for what is boundless."""
     if isinstance(side.shape, HalfSpace):
         return jnp.full_like(side.shape.offset, 1e6)
+    if isinstance(side.shape, Profile):
+        return jnp.full_like(side.shape.points[0, 0], 1e6)
     shape, offset = lax.stop_gradient((side.shape, side.offset))
     dim = side.x.shape[0] if side.flight is None else side.flight.dim
     return reach(shape, dim) if offset is None else reach(shape, dim) + norm(offset)

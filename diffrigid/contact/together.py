@@ -70,7 +70,8 @@ def _moved(P: Array, arms: Arms, mobility: Mobility) -> Array:
 def _slope(cone: Cone, z: Array) -> Slope:
     z_n, z_t = split(cone.normal, z)
     size, bound = jax.vmap(norm)(z_t), cone.mu * jnp.maximum(z_n, 0.0)
-    bound = loaded(cone, jnp.maximum(z_n, 0.0), z_n, bound)[1]
+    if cone.spin is not None:
+        bound = loaded(cone, jnp.maximum(z_n, 0.0), z_n, bound)[1]
     follows = z_n > 0 if cone.most is None else jnp.where(jnp.isinf(cone.most), z_n > 0, jnp.abs(z_n) < cone.most)
     on, slides = jnp.where(follows, cone.on, 0.0), (size >= bound).astype(z.dtype)
     turn, along = jnp.where(size < bound, 1.0, safe_divide(bound, size)), z_t / jnp.where(size > 0, size, 1.0)[:, None]

@@ -14,7 +14,7 @@ import numpy as np
 from diffrigid.forces import Gravity, SpringDamper
 from diffrigid.joints import Distance
 from diffrigid.pytree import align, batch_rank
-from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Shape, Sphere, with_topology
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Profile, Shape, Sphere, with_topology
 from diffrigid.state import State, kinetic_energy
 from diffrigid.step import Trajectory
 from diffrigid.sysid.records import columns
@@ -139,6 +139,10 @@ def _kind(shape: Shape) -> dict[str, Any]:
             return {"kind": "box", "half": _short(shape.half)}
         case HalfSpace():
             return {"kind": "plane", "normal": _short(shape.normal), "offset": _short(shape.offset)}
+        case Profile():
+            line = np.asarray(shape.points, float)
+            left, right, low = line[0, 0], line[-1, 0], line[:, 1].min() - 0.1 * np.ptp(line[:, 0])
+            return {"kind": "hull", "points": _short(np.concatenate([line, [(right, low), (left, low)]]))}
     solid: Any = with_topology(shape)
     faces = {"faces": [list(face) for face in solid.faces]} if len(shape.vertices[0]) == 3 else {}
     return {"kind": "hull", "points": _short(shape.vertices)} | faces

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffrigid.shapes import Capsule, Disc, HalfSpace, Shape, Sphere, edges, vertices
+from diffrigid.shapes import Capsule, Disc, HalfSpace, Profile, Shape, Sphere, edges, vertices
 
 REACH = 50.0  # [m] half width of a drawn half space
 
@@ -10,7 +10,8 @@ REACH = 50.0  # [m] half width of a drawn half space
 def outline(shape: Shape, dim: int, points: int = 48):
     """Lines to draw, NumPy: in 2D one closed polyline (P, 2) [m], in 3D a list of polylines (P_i, 3) [m].
 
-    Round parts have about `points` points a turn. A half space is a long segment (2, 2), or a large square.
+    Round parts have about `points` points a turn. A half space is a long segment (2, 2), or a large square;
+    a profile is its line between its ends.
     """
     return _outline_2d(shape, points) if dim == 2 else _outline_3d(shape, points)
 
@@ -25,6 +26,8 @@ def _outline_2d(shape, points):
             normal = np.asarray(shape.normal)
             along = np.array([-normal[1], normal[0]])
             return float(shape.offset) * normal + REACH * np.stack([along, -along])
+        case Profile():
+            return np.asarray(shape.points)
     return _closed(np.asarray(vertices(shape, 2)))
 
 

@@ -1,0 +1,141 @@
+"""A rounded convex shape and the solid below a polyline, in 2D.
+
+Contacts are those of every corner of the shape with every segment of the profile, and of every vertex of the profile
+with the core of the shape. A corner over a segment has the distance of its line, so that bodies slide over vertices
+as over one line. Beyond the end of a segment
+
+    where it is beyond its neighbour's as well, over a convex vertex: the distance to the vertex is a contact
+    else, above the line of the segment: it may get there within the step, but not touch there: ALERT
+    else: there is nothing to meet
+
+and a vertex of the profile counts where it is convex and the normal of the body lies between those of its segments.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from diffrigid.collide.contacts import Contacts
+from diffrigid.collide.distance import core_distance, reach
+from diffrigid.numerics import dot, norm, normalise
+from diffrigid.shapes import Disc, Profile, radius, vertices
+from diffrigid.state import rotations
+
+FAR = 1e6  # [m] gap of what cannot meet
+ALERT = 4e-3  # [-] of the size: least gap of what may meet within the step; above `NEAR` of the impact time
+TURN = 1e-9  # [rad] by which a convex vertex turns at least
+
+
+def convex_profile(a, x_a: Array, q_a: Array, b: Profile, x_b: Array, q_b: Array) -> Contacts:
+    """Every corner with every segment and, unless a is a disc, every inner vertex of b with a."""
+    so = rotations(2)
+    slack, alert = _lengths(a)
+    corners = jax.vmap(lambda p: so.unrotate(q_b, x_a + so.rotate(q_a, p) - x_b))(vertices(a, 2))
+    parts = [jax.vmap(lambda p: _corner_contacts(b, p, radius(a), slack, alert))(corners)]
+    parts[0] = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), parts[0])
+    if not isinstance(a, Disc):
+
+        def distance(p: Array, inward: Array) -> tuple[Array, Array]:
+            p, inward = x_b + so.rotate(q_b, p), so.rotate(q_b, inward)
+            gap, n = core_distance(a, so.unrotate(q_a, p - x_a), so.unrotate(q_a, inward), slack)
+            return gap, so.unrotate(q_b, so.rotate(q_a, n))
+
+        parts.append(_vertex_contacts(b, distance, radius(a), slack, alert))
+    c = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
+    normal, point = (jax.vmap(lambda r: so.rotate(q_b, r))(r) for r in (c.normal, c.point))
+    return Contacts(gap=c.gap, normal=normal, point=point + x_b[None])
+
+
+def clearance(b: Profile, p: Array) -> Array:
+    """Distance from a point (2, *batch) in the profile's axes to the solid, (*batch) [m]; 0 inside."""
+    start, along, _, length = _segments(b)
+    share = jax.vmap(dot)(along, p[None] - start)
+    low, high = _beyond(share, length)
+    off = jnp.maximum(jnp.maximum(low, high), 0.0)
+    height = jax.vmap(dot)(_up(along), p[None] - start)
+    return jnp.where(_inside(b, p), 0.0, jnp.sqrt(height**2 + off**2).min(0))
+
+
+def _lengths(a) -> tuple[Array, Array]:
+    """Distances within which features coincide, and of the least alert, (*batch) [m]."""
+    size = lax.stop_gradient(reach(a, 2))
+    return np.sqrt(np.finfo(size.dtype).eps).astype(size.dtype) * size, ALERT * size
+
+
+def _segments(b: Profile) -> tuple[Array, Array, Array, Array]:
+    """Starts (S, 2, *batch), unit vectors along, ends, and lengths (S, *batch)."""
+    start, end = b.points[:-1], b.points[1:]
+    length = jax.vmap(norm)(end - start)
+    return start, (end - start) / length[:, None], end, length
+
+
+def _up(along: Array) -> Array:
+    return jnp.stack([-along[:, 1], along[:, 0]], axis=1)
+
+
+def _beyond(share: Array, length: Array) -> tuple[Array, Array]:
+    """How far a point is beyond the start and the end of each segment, (S, *batch) [m]; the outer ones have none."""
+    nowhere = jnp.full_like(share[:1], -jnp.inf)
+    before = jnp.concatenate([nowhere, -share[1:]])
+    return before, jnp.concatenate([(share - length)[:-1], nowhere])
+
+
+def _inside(b: Profile, p: Array) -> Array:
+    """Whether a point (2, *batch) is below the polyline."""
+    start, along, _, _ = _segments(b)
+    height = jax.vmap(dot)(_up(along), p[None] - start)
+    nowhere = jnp.full_like(height[:1], jnp.inf)
+    x = b.points[1:-1, 0] + jnp.zeros_like(height[1:])
+    over = (p[0][None] >= jnp.concatenate([-nowhere, x])) & (p[0][None] < jnp.concatenate([x, nowhere]))
+    return (over & (height < 0)).any(0)
+
+
+def _corner_contacts(b: Profile, p: Array, rounding: Array, slack: Array, alert: Array) -> Contacts:
+    """One corner with all segments, (S, ...), in the profile's axes."""
+    start, along, end, length = _segments(b)
+    up = _up(along)
+    height, share = (jax.vmap(dot)(r, p[None] - start) for r in (up, along))
+    before, after = _beyond(share, length)
+    over = jnp.maximum(before, after) <= slack[None]
+    best = jnp.where(over & (height < 0), height, -jnp.inf).max(0)  # inside, the least deep
+    # `slack`: what is computed twice may be rounded differently.
+    touches = over & ((height >= -slack[None]) | (_inside(b, p)[None] & (height >= (best - slack)[None])))
+    next_before = jnp.concatenate([before[1:], jnp.full_like(before[:1], -jnp.inf)])
+    at_vertex = (after > slack[None]) & (next_before > slack[None]) & (height > slack[None])
+    near_end = jnp.where((before > after)[:, None], start, end)
+    away = p[None] - jnp.where(at_vertex[:, None], end, near_end)
+    distance, direction = jax.vmap(norm)(away), jax.vmap(normalise)(away)
+    may_meet = ~over & (height > slack[None]) & ~((before > slack[None]) & _shifted(at_vertex))
+    gap = jnp.where(at_vertex, distance - rounding[None], jnp.maximum(distance - rounding[None], alert[None]))
+    gap = jnp.where(at_vertex | may_meet, gap, FAR)
+    gap = jnp.where(touches, height - rounding[None], gap)
+    normal = jnp.where((at_vertex | may_meet)[:, None] & ~touches[:, None], direction, up)
+    return Contacts(gap=gap, normal=normal, point=p[None] - (rounding[None] + 0.5 * gap)[:, None] * normal)
+
+
+def _shifted(flags: Array) -> Array:
+    """Flags of each segment for the next."""
+    return jnp.concatenate([jnp.zeros_like(flags[:1]), flags[:-1]])
+
+
+def _vertex_contacts(b: Profile, distance_of, rounding: Array, slack: Array, alert: Array) -> Contacts:
+    """The inner vertices with the core of a body, (S - 1, ...), in the profile's axes."""
+    _, along, _, length = _segments(b)
+    up = _up(along)
+
+    def one(p, along_0, along_1, up_0, up_1, size):
+        inward = lax.stop_gradient(-size[None] * (up_0 + up_1))
+        distance, n = distance_of(p + jnp.zeros_like(inward), inward)
+        gap = distance - rounding
+        convex = _cross(along_0, along_1) < -TURN
+        between = (_cross(up_0, -n) <= TURN) & (_cross(-n, up_1) <= TURN) & (dot(-n, up_0 + up_1) > 0)
+        far = jnp.where(convex & (distance > slack), jnp.maximum(gap, alert), FAR)
+        gap = jnp.where(convex & between, gap, far)
+        return Contacts(gap=gap, normal=-n, point=p - 0.5 * gap[None] * n)
+
+    return jax.vmap(one)(b.points[1:-1], along[:-1], along[1:], up[:-1], up[1:], length[1:])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[0] * b[1] - a[1] * b[0]
