@@ -11,8 +11,8 @@ record; and for one fit more from one start. Each case in a process of its own.
 The peers minimise the same residuals: MuJoCo with its own toolbox (`mujoco.sysid`), pymunk and Box2D with
 `scipy.optimize.least_squares`. What helped them most was found by trial: differences of 1 % on both sides of a number
 instead of 1.5e-8, so that the jumps which a fixed step makes where an impact crosses it average out; numbers scaled by
-the Jacobian; 64 steps a frame (pymunk and Box2D are then 0.6 and 0.3 mm from the closed form at worst, with 16 steps 1.9
-and 1.0). MuJoCo has no restitution: a spring of 1e6 / s^2 and the damper that rebounds alike take its place, at 128
+the Jacobian; 64 steps a frame (pymunk and Box2D are then 0.6 and 0.3 mm from the closed form at worst, with 16 steps
+1.9 and 1.0). MuJoCo has no restitution: a spring of 1e6 / s^2 and the damper that rebounds alike take its place, at 128
 steps a frame; softer springs bias it (1e5: restitution by 0.007). Its own differences are on one side only.
 "As it comes" leaves the optimiser as it is.
 
