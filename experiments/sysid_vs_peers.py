@@ -31,9 +31,10 @@ AMD EPYC beside other work, so CPU-seconds are good to some tens of per cent):
 
 So on this small job pymunk and Box2D find the same once their differences are large, in less time, most of that of
 diffrigid being compiling; it needs no step of differences and is five times faster from then on. Box2D computes in
-float32, in which a difference of 1.5e-8 is none. MuJoCo's step is 0.01 or 1 % of a number, the larger: 10 % of v_y. With
-v_y in units of 0.1 m/s 3 of the first 6 records are found instead of 2, and with SciPy and the settings of pymunk on its
-rollouts 1 of the first 4; starts that fail end at a bound of the restitution or far from it. There may be better ones.
+float32, in which a difference of 1.5e-8 is none. MuJoCo's step is 0.01 or 1 % of a number, the larger: 10 % of v_y.
+With v_y in units of 0.1 m/s 3 of the first 6 records are found instead of 2, and with SciPy and the settings of
+pymunk on its rollouts 1 of the first 4; starts that fail end at a bound of the restitution or far from it. There may
+be better ones.
 """
 
 import argparse
