@@ -178,7 +178,7 @@ GOOD = {"t": T, "cue.x": np.zeros((6, 2))}
         (GOOD, {"starts": 0}, "integer >= 1"),
         (GOOD, {"widths": ()}, "widths"),
         (GOOD, {"windows": (0.0,)}, "windows"),
-        (GOOD, {"dt": -1.0}, "expected > 0"),
+        (GOOD, {"dt": -1.0}, "dt is -1: expected above 0"),
         ([dr.Record(GOOD, start=0.2)], {}, "make it earlier"),
         ([dr.Record(GOOD, world=SOLID)], {}, "2D|3D"),
     ],
