@@ -10,8 +10,8 @@ memory is that of the temporaries of the compiled program. Peaks of the process,
 
 One sweep a step: a body that is struck twice in 4 ms is repaired in the next step, as the peers do.
 
-2026-11-22, one core of an AMD EPYC (Zen 5): pymunk 1.3e6 (S1), 6.1e5 (S2); Box2D 6.1e5, 2.4e5; diffrigid 1.6e8 to
-1.9e8 and 2.0e6, that is 118 to 140 and 3.3 times pymunk; gradient over forward 5 (S1) and 8 (S2).
+2026-11-22, one core of an AMD EPYC (Zen 5): pymunk 1.3e6 (S1), 6.2e5 (S2); Box2D 6.1e5, 2.5e5; diffrigid 1.6e8 to
+1.9e8 and 1.9e6, that is 118 to 140 and 3.1 times pymunk; gradient over forward 5 (S1) and 8 (S2).
 """
 
 import argparse
