@@ -223,13 +223,6 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_loaded_is_named(case, write):
-    text, message = REFUSED[case]
-    with pytest.raises(ValueError, match=message):
-        dr.load_mjcf(write(text))
-
-
 URDF_REFUSED = {
     "no mass": (ROBOT.replace("inertial>", "visual>"), "moves and has no mass"),
     "type": (ROBOT.replace('"continuous"', '"planar"'), "joint 'elbow' has the type 'planar'"),
@@ -241,11 +234,14 @@ URDF_REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", URDF_REFUSED)
-def test_what_cannot_be_loaded_of_a_urdf_is_named(case, write):
-    text, message = URDF_REFUSED[case]
+@pytest.mark.parametrize(
+    "load, refused, case",
+    [(dr.load_mjcf, REFUSED, case) for case in REFUSED] + [(dr.load_urdf, URDF_REFUSED, case) for case in URDF_REFUSED],
+)
+def test_what_cannot_be_loaded_is_named(load, refused, case, write):
+    text, message = refused[case]
     with pytest.raises(ValueError, match=message):
-        dr.load_urdf(write(text))
+        load(write(text))
 
 
 def test_quaternions_of_all_rotations():

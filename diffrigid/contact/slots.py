@@ -164,7 +164,11 @@ def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
 
 
 def sum_of_terms(weights: Array, values: Array, axis: int) -> Array:
-    # Term by term: XLA's own reduction of such a product takes twice the time.
+    """Sum over one of the two axes of weights (A, B, *batch) times values (A or B, F, *batch) along it.
+
+    Term by term: XLA's own reduction of such a product takes twice the time.
+    """
+
     def add(total, term):
         k, value = term
         weight = lax.dynamic_index_in_dim(weights, k, axis, keepdims=False)
