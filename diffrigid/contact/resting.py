@@ -52,7 +52,10 @@ def solve_impulses(
     others = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
     others = lax.stop_gradient(others)
     shared = strikes.active & ((others > 1) | (mobility.link is not None))
-    alone = impulses(strikes.active & ~shared, strikes.K, strikes.normal, strikes.v_rel, target, mu)
+    by_itself = strikes.active & ~shared
+    alone = lax.cond(
+        jnp.any(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu
+    )
     scale = lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
     cone = Cone(
         on=shared.astype(others.dtype), crowd=jnp.maximum(others, 1.0), scale=scale, normal=strikes.normal,
@@ -62,3 +65,8 @@ def solve_impulses(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, jac=strikes.jac, spin=strikes.spin, a=strikes.a, b=strikes.b
     )  # fmt: skip
     return alone + solve_together(jnp.any(shared), cone, strikes.v_rel, arms, mobility)
+
+
+def _none(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
+    del on, K, n, target, mu
+    return jnp.zeros_like(v)
