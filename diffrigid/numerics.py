@@ -72,6 +72,32 @@ def rows(values: Array, index: tuple) -> Array:
     return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
+def sum_rows(values: Array, index: tuple) -> Array:
+    """Sums of rows of values (M, ...), for an index known when tracing, (len(index), ...); M stands for nothing.
+
+    Where each sum is over a run of rows and one run follows the other, it is written out. Else rows are gathered, padded
+    to the most that any sum has: forward that is one fused loop, where a scatter is a serial one.
+    """
+    distinct = tuple(dict.fromkeys(index))
+    runs = [tuple(i for i in row if i < len(values)) for row in distinct]
+    start, length = min(runs[0], default=0), len(runs[0])
+    if length and sum(runs, ()) == tuple(range(start, start + length * len(runs))):
+        part = values[start : start + length * len(runs)]
+        sums = fold(jnp.add, part.reshape(len(runs), length, *part.shape[1:]), 1)
+    else:
+        sums = rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), distinct).sum(1)
+    if distinct == index:
+        return sums
+    if index == tuple(row for row in distinct for _ in range(len(index) // len(distinct))):
+        return jnp.repeat(sums, len(index) // len(distinct), axis=0)
+    return rows(sums, tuple(distinct.index(row) for row in index))
+
+
+def fold(op: Any, table: Array, axis: int) -> Array:
+    """Reduction over one axis in front of the batch. Written out: XLA's own is slow."""
+    return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
+
+
 def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]], Any]]:
     """The leaves (M, ..., *batch) of a tree side by side, as one array (M, F, *batch) for each shape of the batch.
 
@@ -213,13 +239,50 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
     return lax.custom_linear_solve(product, right, solve, symmetric=True)
 
 
-def inverse_matrix(matrix: Array) -> Array:
-    """Inverse of regular matrices (R, R, *batch), without derivative."""
+def solve_regular(matrix: Array, right: Array) -> Array:
+    """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), without derivative.
+
+    Up to three rows by cofactors, up to six by two blocks of these. The upper block has to be regular too.
+    """
+    matrix, right = lax.stop_gradient((matrix, right))
     if len(matrix) > LARGE:
-        q, r = lax.linalg.qr(jnp.moveaxis(lax.stop_gradient(matrix), (0, 1), (-2, -1)))
-        inverse = lax.linalg.triangular_solve(r, jnp.swapaxes(q, -2, -1), left_side=True)
-        return jnp.moveaxis(inverse, (-2, -1), (0, 1))
-    return _gauss_jordan(matrix, identity(matrix), jnp.zeros_like(matrix[0, 0]))
+        q, r = lax.linalg.qr(jnp.moveaxis(matrix, (0, 1), (-2, -1)))
+        turned = jnp.swapaxes(q, -2, -1) @ jnp.moveaxis(right, (0, 1), (-2, -1))
+        return jnp.moveaxis(lax.linalg.triangular_solve(r, turned, left_side=True), (-2, -1), (0, 1))
+    if len(matrix) <= 3:
+        return _product(_inverse_by_cofactors(matrix), right)
+    if len(matrix) > 6:
+        return _gauss_jordan(matrix, right, jnp.zeros_like(matrix[0, 0]))
+    inverse = _inverse_by_cofactors(matrix[:3, :3])
+    across, upper = _product(inverse, matrix[:3, 3:]), _product(inverse, right[:3])
+    rest = _inverse_by_cofactors(matrix[3:, 3:] - _product(matrix[3:, :3], across))
+    lower = _product(rest, right[3:] - _product(matrix[3:, :3], upper))
+    return jnp.concatenate([upper - _product(across, lower), lower])
+
+
+def _product(a: Array, b: Array) -> Array:
+    """(I, J, *batch) times (J, K, *batch), written out."""
+    return functools.reduce(jnp.add, (a[:, j, None] * b[None, j] for j in range(a.shape[1])))
+
+
+def _inverse_by_cofactors(matrix: Array) -> Array:
+    """Inverse of (R, R, *batch), R up to 3; 0 where it is singular."""
+    m = [list(row) for row in matrix]
+    if len(m) == 1:
+        return safe_divide(jnp.ones_like(matrix), matrix)
+    if len(m) == 2:
+        (a, b), (c, d) = m
+        adjugate, det = [[d, -b], [-c, a]], a * d - b * c
+    else:
+        (a, b, c), (d, e, f), (g, h, i) = m
+        adjugate = [
+            [e * i - f * h, c * h - b * i, b * f - c * e],
+            [f * g - d * i, a * i - c * g, c * d - a * f],
+            [d * h - e * g, b * g - a * h, a * e - b * d],
+        ]
+        det = a * adjugate[0][0] + b * adjugate[1][0] + c * adjugate[2][0]
+    whole = components(*(components(*row) for row in adjugate))
+    return whole * safe_divide(jnp.ones_like(det), det)[None, None]
 
 
 def identity(like: Array) -> Array:

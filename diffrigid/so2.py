@@ -134,3 +134,9 @@ def gyroscopic(inertia: Array, q: Array, w: Array) -> Array:
     """w x L, (1, *batch) [N m]: none in the plane."""
     del inertia, q
     return jnp.zeros_like(w)
+
+
+def precession(L: Array, w: Array) -> Array:
+    """I dw of a free body, (1, *batch) [N m]: none in the plane."""
+    del L
+    return jnp.zeros_like(w)

@@ -238,6 +238,11 @@ def gyroscopic(inertia: Array, q: Array, w: Array) -> Array:
     return cross(w, spin(inertia, q, w))
 
 
+def precession(L: Array, w: Array) -> Array:
+    """L x w = I dw of a free body, (3, *batch) [N m], world axes: Euler's equations."""
+    return cross(L, w)
+
+
 def tangents(n: Array) -> list[Array]:
     """Two unit vectors that with the unit vector n make a right-handed frame, (3, *batch) each.
 

@@ -35,6 +35,7 @@ from diffrigid.state import rotations
 
 ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
 POLISH = 6  # steps along the local parabola of the gap; error squared by each
+HOP = 0.1  # [-] of the step: a near contact that opens for less is handed over as well
 NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over to polishing
 
 
@@ -195,7 +196,7 @@ def _approach_search(a: Side, b: Side, t1: Array, width: Array | None) -> tuple[
         return _closest_level(a, b, near, t1 - start, width, live)  # type: ignore[arg-type]
 
     level = _if_smooth(width, smooth, jnp.zeros_like, near)
-    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, t1 - start, live)
+    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, start, t1, live)
     return jnp.where(s < bound, start, s), level, found
 
 
@@ -225,23 +226,26 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
 
     Each advance is the least, over the contacts, of the gap over a bound on the closing speed for the present
     normal (Mirtich 1996), so that a body that only translates arrives in one. The gap of a corner and a plane is
-    a smooth function of time: it stays above a parabola as bent as any point of the body can be, which takes a tenth
-    of the advances. A contact that touches and separates may be passed for as long as its parabola stays open.
+    a smooth function of time: until t1 it stays above the parabola that is its own, bent down further by as much as its
+    third derivative can be, which takes two or three advances. A contact that touches and separates may be passed for
+    as long as its parabola stays open.
     """
     live, span = jnp.any(t1 > 0), jnp.maximum(t1 - start, 0.0)
-    (spin_a, bend_a), (spin_b, bend_b) = _unsteady(a, span), _unsteady(b, span)
-    spinning, bend = spin_a + spin_b, bend_a + bend_b
+    (spin_a, jerk_a), (spin_b, jerk_b) = _unsteady(a, span), _unsteady(b, span)
+    spinning, jerk = spin_a + spin_b, jerk_a + jerk_b
     corners = isinstance(b.shape, HalfSpace)
 
     def safe_time(s):
         contacts, v, acc = _motion(a, b, s, live)
         if corners:
-            apart = safe_divide(2.0 * contacts.gap, safe_sqrt(v * v + 2.0 * bend[None] * contacts.gap) - v)
+            apart = _time_to(contacts.gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
         else:
             approach = centre(a, s)[1] - centre(b, s)[1]
             bound = jnp.maximum(-(contacts.normal * approach[None]).sum(1), 0.0) + spinning[None]
             apart = jnp.where(bound > 0, safe_divide(contacts.gap, bound), jnp.inf)
-        return jnp.where(contacts.gap > near[None], apart, jnp.where(v < 0, 0.0, _time_to(contacts.gap, v, acc))).min(0)
+        returns = _time_to(contacts.gap, v, acc)
+        returns = jnp.where(returns > HOP * span[None], returns, 0.0)  # negative where it closes
+        return jnp.where(contacts.gap > near[None], apart, returns).min(0)
 
     def busy(carry):
         count, s, dt = carry
@@ -256,26 +260,29 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
 
 
 def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
-    """Bounds within the step on what spin and acceleration add to the speed of a point, and on its acceleration.
+    """Bounds within the step on what spin and acceleration add to the speed of a point, and on its third derivative.
 
-    (*batch) [m/s], [m/s^2]. Without a torque a rigid body has no greater angular acceleration than w^2.
+    (*batch) [m/s], [m/s^3]. Without a torque a rigid body has no greater angular acceleration than w^2, which bounds
+    the third derivative of an arm r by 6 w^3 r.
     """
     f = side.flight
     if f is None:
         return jnp.zeros_like(span), jnp.zeros_like(span)
     so, reach = rotations(f.dim), reach_of(side)
     w, a = norm(so.unspin(f.inverse_inertia, f.q, f.L)), norm(f.a)
+    jerk = 8.0 * w * w * w * reach
     if f.jerk is not None:
-        a = a + span * norm(f.jerk)
-    bend = a + 2.5 * w * w * reach
+        a, jerk = a + span * norm(f.jerk), jerk + norm(f.jerk)
     if f.tau is not None:
-        bend = bend + reach * norm(so.unspin(f.inverse_inertia, f.q, f.tau))
-    return 1.1 * w * reach + a * span, bend
+        jerk = jerk + 4.0 * w * reach * norm(so.unspin(f.inverse_inertia, f.q, f.tau))
+    return 1.1 * w * reach + a * span, jerk
 
 
-def _polish(a: Side, b: Side, s: Array, level: Array, size: Array, span: Array, live: Array) -> tuple[Array, Array]:
+def _polish(
+    a: Side, b: Side, s: Array, level: Array, size: Array, start: Array, t1: Array, live: Array
+) -> tuple[Array, Array]:
     """Time near s at which the first contact comes to gap = level, and whether one does; s if inside and closing."""
-    slack, near = jnp.sqrt(jnp.finfo(s.dtype).eps), s
+    slack, near, span = jnp.sqrt(jnp.finfo(s.dtype).eps), s, t1 - start
 
     def busy(carry):
         count, _, dt, *_ = carry
@@ -284,8 +291,10 @@ def _polish(a: Side, b: Side, s: Array, level: Array, size: Array, span: Array, 
     def towards(carry):
         count, s, _, _, inside = carry
         contacts, v, acc = _motion(a, b, s, live)
-        dt = _time_to(contacts.gap - level[None], v, acc).min(0)
-        dt = jnp.where(jnp.isfinite(dt), dt, 0.0)
+        height = contacts.gap - level[None]
+        there = (jnp.abs(height) <= 8.0 * slack**2 * size[None]) & (v < 0)  # to rounding
+        dt = jnp.where(there, 0.0, _time_to(height, v, acc)).min(0)
+        dt = jnp.where(jnp.isfinite(dt) & ((dt < 0) | (s < t1 + slack * span)), dt, 0.0)  # what is later is no impact
         at_level = (contacts.gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0))
         inside = jnp.where(count == 0, ((contacts.gap <= level[None]) & (v < 0)).any(0), inside)
         return count + 1, s + dt, dt, at_level.any(0), inside

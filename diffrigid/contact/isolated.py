@@ -20,11 +20,11 @@ from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
 from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.sides import Side
-from diffrigid.contact.slots import Slots, Table, fold, meet, sides_of_table, sum_of_terms, summed
+from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, sum_of_terms, summed
 from diffrigid.contact.strikes import is_rolling, materials, mixed, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
-from diffrigid.numerics import apart, constant, dot
+from diffrigid.numerics import apart, constant, dot, fold
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 

@@ -10,7 +10,7 @@ from jax import Array
 from diffrigid.contact.cone import put
 from diffrigid.contact.sides import at_colliders, between_bodies, side_sum
 from diffrigid.linkage import Linkage, spread
-from diffrigid.numerics import dot, identity, inverse_matrix, rows, unit_vector
+from diffrigid.numerics import dot, identity, rows, unit_vector
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import rotations
 
@@ -51,15 +51,24 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
     so = rotations(P.shape[1])
     points, along, every = _points(arms), P[len(P) - _rows(arms) :, :1], P
     P = P[:points]
-    on_a = jnp.concatenate([P, jax.vmap(so.moment)(arms.arm_a[:points], P)], axis=1)
-    on_b = jnp.concatenate([-P, jax.vmap(so.moment)(arms.arm_b[:points], -P)], axis=1)
+    push, moments = ([P], [-P]), tuple([jax.vmap(so.moment)(arm[:points], P)] for arm in (arms.arm_a, -arms.arm_b))
     if arms.spin is not None:
-        turn = jnp.concatenate([jnp.zeros_like(P), every[points : 2 * points, : so.A]], axis=1)
-        on_a, on_b = jnp.concatenate([on_a, turn]), jnp.concatenate([on_b, -turn])
+        for sign, pushes, turns in zip((1.0, -1.0), push, moments, strict=True):
+            pushes.append(jnp.zeros_like(P))
+            turns.append(sign * every[points : 2 * points, : so.A])
     if arms.jac is not None:
-        on_a, on_b = (jnp.concatenate([on, along * arms.jac[:, side]]) for side, on in enumerate((on_a, on_b)))
-    total = side_sum(on_a, on_b, arms.a, arms.b, moving)
-    return total[:, : so.D], total[:, so.D :]
+        for side, (pushes, turns) in enumerate(zip(push, moments, strict=True)):
+            pushes.append(along * arms.jac[:, side, : so.D])
+            turns.append(along * arms.jac[:, side, so.D :])
+
+    def total(on_a: list[Array], on_b: list[Array]) -> Array:
+        return side_sum(_joined(on_a), _joined(on_b), arms.a, arms.b, moving)
+
+    return total(*push), total(*moments)
+
+
+def _joined(parts: list[Array]) -> Array:
+    return jnp.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
 def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, Array]:
@@ -74,23 +83,19 @@ def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, 
 
 def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
     """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
-    so, both = rotations(dv.shape[1]), jnp.concatenate([dv, dw], axis=1)
-    at_a, at_b = at_colliders(both, arms.a, 0.0), at_colliders(both, arms.b, 0.0)
+    so, points, rows_from = rotations(dv.shape[1]), _points(arms), len(arms.a) - _rows(arms)
+    (v_a, w_a), (v_b, w_b) = ([at_colliders(d, side, 0.0) for d in (dv, dw)] for side in (arms.a, arms.b))
 
-    def point_velocity(at, arm):
-        return at[: so.D] + so.cross(at[so.D :], arm)
+    def point_velocity(v: Array, w: Array, arm: Array) -> Array:
+        return v[:points] + jax.vmap(so.cross)(w[:points], arm[:points])
 
-    points, rows_from = _points(arms), len(arms.a) - _rows(arms)
-    on_a, on_b = (
-        jax.vmap(point_velocity)(at[:points], arm[:points]) for at, arm in ((at_a, arms.arm_a), (at_b, arms.arm_b))
-    )
-    parts = [on_a - on_b]
+    parts = [point_velocity(v_a, w_a, arms.arm_a) - point_velocity(v_b, w_b, arms.arm_b)]
     if arms.spin is not None:
-        parts.append(_as_vectors(at_a[points:rows_from, so.D :] - at_b[points:rows_from, so.D :], so.D))
+        parts.append(_as_vectors(w_a[points:rows_from] - w_b[points:rows_from], so.D))
     if arms.jac is not None:
-        rates = (arms.jac * jnp.stack([at_a[rows_from:], at_b[rows_from:]], axis=1)).sum((1, 2))
-        parts.append(_first(rates, so.D))
-    return jnp.concatenate(parts) if len(parts) > 1 else parts[0]
+        twists = jnp.stack([jnp.concatenate([d[rows_from:] for d in pair], 1) for pair in ((v_a, w_a), (v_b, w_b))], 1)
+        parts.append(_first((arms.jac * twists).sum((1, 2)), so.D))
+    return _joined(parts)
 
 
 def _rows(arms: Any) -> int:
@@ -112,21 +117,26 @@ def _first(values: Array, D: int) -> Array:
     return values[:, None] * unit_vector(jnp.zeros((D, *values.shape[1:]), values.dtype), 0)[None]
 
 
+def moved(P: Array, arms: Any, mobility: Mobility) -> Array:
+    """J G J^T P: changes of the relative velocities by impulses, (C, D, *batch) [m/s]."""
+    return relative_changes(arms, *velocities(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))[:2])
+
+
 def twists(P: Array, arms: Any, mobility: Mobility) -> Array:
-    """G J^T P: the change of the twists of all bodies by impulses, (C, *batch)."""
+    """G J^T P: the change of the twists of all bodies by impulses, (R, *batch)."""
     dv, dw, _ = velocities(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
     return jnp.concatenate([dv, dw], axis=1).reshape(-1, *P.shape[2:])
 
 
 def at_contacts(arms: Any, twist: Array) -> Array:
-    """J u: `relative_changes` for the twists of all bodies in one, (C, *batch)."""
+    """J u: `relative_changes` for the twists of all bodies in one, (R, *batch)."""
     D = arms.arm_a.shape[1]
     by_body = twist.reshape(-1, D + rotations(D).A, *twist.shape[1:])
     return relative_changes(arms, by_body[:, :D], by_body[:, D:])
 
 
-def bodies_inverse(answer: Callable, arms: Any, mobility: Mobility) -> Array:
-    """Inverse of 1 + G J^T A J, (R, R, *batch) with R components of the twists of all bodies.
+def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
+    """1 + G J^T A J, (R, R, *batch) with R components of the twists of all bodies.
 
     Args:
         answer: the linear map A, contact by contact: impulses (C, D, *batch) for relative velocities.
@@ -161,12 +171,12 @@ def bodies_inverse(answer: Callable, arms: Any, mobility: Mobility) -> Array:
         whole = whole + rows(across, between).sum(1).reshape(moving, moving, size, size, *batch)
     columns = jnp.moveaxis(whole, (1, 3), (0, 1)).reshape(moving * size, moving, size, *batch)
 
-    def moved(column):
+    def twisted(column):
         dv, dw, _ = velocities(mobility, column[:, :D], column[:, D:])
         return jnp.concatenate([dv, dw], axis=1).reshape(-1, *batch)
 
-    matrix = jax.vmap(moved, out_axes=1)(columns)
-    return inverse_matrix(identity(matrix) + matrix)
+    matrix = jax.vmap(twisted, out_axes=1)(columns)
+    return identity(matrix) + matrix
 
 
 def _by_units(so: Any, arm: Array) -> Array:

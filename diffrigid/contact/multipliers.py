@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.cone import Cone, nearest, put, split
-from diffrigid.contact.mobility import Mobility, at_contacts, bodies_inverse, twists
-from diffrigid.numerics import norm
+from diffrigid.contact.mobility import Mobility, at_contacts, bodies_matrix, twists
+from diffrigid.numerics import norm, solve_regular
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most
@@ -58,8 +58,8 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
         P = jnp.where(ready[None, None], F, P)
         F = pushed(P, y)
         off = u - twists(F, arms, mobility)
-        inverse = bodies_inverse(lambda dy: -jax.jvp(lambda y: pushed(P, y), (y,), (dy,))[1], arms, mobility)
-        du = -(inverse * off[None]).sum(1)
+        matrix = bodies_matrix(lambda dy: -jax.jvp(lambda y: pushed(P, y), (y,), (dy,))[1], arms, mobility)
+        du = -solve_regular(matrix, off[:, None])[:, 0]
         dy, weight = at_contacts(arms, du), _momenta(du, mobility, D)
 
         def ahead(share: Array) -> Array:  # slope of the convex function there

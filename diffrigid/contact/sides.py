@@ -9,8 +9,8 @@ from jax import Array, lax
 
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.distance import reach
-from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
-from diffrigid.numerics import apart, dot, norm, rows
+from diffrigid.flight import Flight, acceleration, angular_momentum, orientation, position, torque, velocity
+from diffrigid.numerics import apart, dot, norm, rows, sum_rows
 from diffrigid.pytree import array, pytree
 from diffrigid.shapes import HalfSpace, Profile
 from diffrigid.state import rotations
@@ -37,6 +37,7 @@ class Placed:
     v: Any = array("D", default=None)  # [m/s]
     w: Any = array("A", default=None)  # [rad/s]
     a: Any = array("D", default=None)  # [m/s^2]
+    dw: Any = array("A", default=None)  # [rad/s^2]
     inverse_mass: Any = array(default=None)  # [1/kg]
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
 
@@ -70,9 +71,12 @@ def place(side: Side, s: Array, live: Array) -> Placed:
     so = rotations(f.dim)
     q = apart(live, orientation, f, s)
     inverse = apart(live, so.world_inverse, f.inverse_inertia, q)
-    w = so.apply(inverse, angular_momentum(f, s))
-    x, v = position(f, s), velocity(f, s)
-    return Placed(x=x, q=q, v=v, w=w, a=f.a, inverse_mass=f.inverse_mass, inverse_inertia=inverse)
+    L, tau = angular_momentum(f, s), torque(f, s)
+    w = so.apply(inverse, L)
+    turning = so.precession(L, w) if tau is None else so.precession(L, w) + tau
+    dw = so.apply(inverse, turning)
+    x, v, a = position(f, s), velocity(f, s), acceleration(f, s)
+    return Placed(x=x, q=q, v=v, w=w, a=a, dw=dw, inverse_mass=f.inverse_mass, inverse_inertia=inverse)
 
 
 def centre(side: Side, s: Array) -> tuple[Array, Array]:
@@ -100,11 +104,11 @@ def relative_velocity(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) ->
 
 
 def relative_acceleration(at_a: Placed, at_b: Placed, point: Array) -> Array:
-    """Acceleration of a against b at a world point, a + w x (w x r) of each, without angular acceleration."""
+    """Acceleration of a against b at a world point, a + dw x r + w x (w x r) of each, (D, *batch) [m/s^2]."""
 
     def one(at, arm):
         cross = rotations(arm.shape[0]).cross
-        return at.a + cross(at.w, cross(at.w, arm))
+        return at.a + cross(at.dw, arm) + cross(at.w, cross(at.w, arm))
 
     return _difference(one, at_a, point - at_a.x, at_b, point - at_b.x)
 
@@ -136,13 +140,8 @@ def reach_of(side: Side) -> Array:
 
 
 def side_sum(values_a: Array, values_b: Array, a: tuple[int, ...], b: tuple[int, ...], moving: int) -> Array:
-    """Sum of per-contact values over the contacts of each moving body, (N, ...).
-
-    By gathering each body's contacts, padded to the most any body has: forward it is one fused loop, where a
-    scatter is a serial one.
-    """
-    padded = jnp.concatenate([values_a, values_b, jnp.zeros_like(values_a[:1])])
-    return rows(padded, body_sides(a, b, moving)).sum(1)
+    """Sum of per-contact values over the contacts of each moving body, (N, ...)."""
+    return sum_rows(jnp.concatenate([values_a, values_b]), body_sides(a, b, moving))
 
 
 @functools.cache

@@ -10,7 +10,7 @@ from diffrigid.contact.cone import put, turning
 from diffrigid.contact.mobility import momentum_changes
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import at_colliders, same_bodies
-from diffrigid.numerics import constant, dot, norm, rows, safe_divide
+from diffrigid.numerics import constant, dot, norm, safe_divide, sum_rows
 from diffrigid.pytree import replace
 
 CREEP = 1e-6  # [m/s] of a slip that is none
@@ -64,7 +64,7 @@ def lost_to_stops(strikes: Any, T: Array, slip: Array, at_end: Array, friction: 
     together = same_bodies(strikes.a, strikes.b)
 
     def in_all(values: Array) -> Array:  # over the contacts of the same two bodies, which slip as one
-        return rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), together).sum(1)
+        return sum_rows(values, together)
 
     speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])

@@ -19,7 +19,7 @@ from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
 from diffrigid.contact.strikes import law, materials, strikes_of
 from diffrigid.flight import Flight, orientation
-from diffrigid.numerics import apart, dot, pack
+from diffrigid.numerics import apart, dot, fold, pack
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 
@@ -123,11 +123,6 @@ def _where(chosen: Array, new: Array, old: Array) -> Array:
 def summed(weights: Array) -> Array:
     """(E, A, *batch) to (E, *batch)."""
     return fold(jnp.add, weights, 1)
-
-
-def fold(op: Any, table: Array, axis: int) -> Array:
-    """Reduction over one axis in front of the batch. Written out: XLA's own is slow."""
-    return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
 
 
 def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:

@@ -29,9 +29,9 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
-from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_inverse, twists
+from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
-from diffrigid.numerics import FOUND, dot, norm, safe_divide
+from diffrigid.numerics import FOUND, dot, identity, norm, safe_divide, solve_regular
 from diffrigid.pytree import array, pytree, replace
 
 ROUNDS = 40  # at most, of Newton's method
@@ -58,13 +58,8 @@ class Slope:
 
 def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
     """z, (C, D, *batch) [N s]."""
-    y = v_rel + _moved(P, arms, mobility)
+    y = v_rel + moved(P, arms, mobility)
     return P - (y - cone.target[:, None] * cone.normal) / cone.scale[:, None]
-
-
-def _moved(P: Array, arms: Arms, mobility: Mobility) -> Array:
-    """W P: changes of the relative velocities, (C, D, *batch) [m/s]."""
-    return at_contacts(arms, twists(P, arms, mobility))
 
 
 def _slope(cone: Cone, z: Array) -> Slope:
@@ -142,11 +137,10 @@ def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
     return _answer(slope, cone)(at_contacts(arms, twist))
 
 
-def _newton_step(r: Array, inverse: Array, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
+def _newton_step(r: Array, solved: Callable, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
     """dP of (B + D W / k) dP = r, (C, D, *batch)."""
     direct = _unsloped(slope, _small(r.dtype), r)[0]
-    twist = (inverse * twists(direct, arms, mobility)[None]).sum(1)
-    return direct - _pushed_back(slope, cone, arms, twist)
+    return direct - _pushed_back(slope, cone, arms, solved(twists(direct, arms, mobility)))
 
 
 @jax.custom_jvp
@@ -191,7 +185,8 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         better = size < error
         best, since = jnp.where(better[None, None], P, best), jnp.where(better, 0, since + 1)
         slope = _slope(cone, z)
-        dP = _newton_step(r, bodies_inverse(_answer(slope, cone), arms, mobility), slope, cone, arms, mobility)
+        matrix = bodies_matrix(_answer(slope, cone), arms, mobility)
+        dP = _newton_step(r, lambda u: solve_regular(matrix, u[:, None])[:, 0], slope, cone, arms, mobility)
         P = lax.fori_loop(0, SMOOTHING, smoother, allowed(cone, P + dP))
         return count + 1, P, best, jnp.minimum(size, error), since
 
@@ -212,18 +207,19 @@ def _solve_together_jvp(primals, tangents):
     def projected(cone, v_rel, arms, mobility):
         return allowed(cone, _excess(cone, P, v_rel, arms, mobility))
 
-    moved = jax.jvp(projected, primals[1:], tangents[1:])[1]
+    change = jax.jvp(projected, primals[1:], tangents[1:])[1]
     slope = lax.stop_gradient(_slope(cone, _excess(cone, P, v_rel, arms, mobility)))
     fixed = lax.stop_gradient((slope, cone, arms, mobility))
 
     def linear(x):
-        return x - _sloped(slope, x - _moved(x, arms, mobility) / cone.scale[:, None])
+        return x - _sloped(slope, x - moved(x, arms, mobility) / cone.scale[:, None])
 
     def refined(matvec, b, transposed):
-        inverse = bodies_inverse(_answer(*fixed[:2]), *fixed[2:])
+        matrix = bodies_matrix(_answer(*fixed[:2]), *fixed[2:])
+        inverse = solve_regular(matrix, identity(matrix))
 
         def step(r):
-            return _newton_step(r, inverse, *fixed)
+            return _newton_step(r, lambda u: (inverse * u[None]).sum(1), *fixed)
 
         approximate = (lambda r: jax.linear_transpose(step, b)(r)[0]) if transposed else step
         return lax.fori_loop(0, REFINEMENTS, lambda _, x: x + approximate(b - matvec(x)), jnp.zeros_like(b))
@@ -231,4 +227,4 @@ def _solve_together_jvp(primals, tangents):
     def solve(matvec, b, transposed=False):
         return lax.cond(shared, lambda b: refined(matvec, b, transposed), jnp.zeros_like, b)
 
-    return P, lax.custom_linear_solve(linear, moved, solve, transpose_solve=functools.partial(solve, transposed=True))
+    return P, lax.custom_linear_solve(linear, change, solve, transpose_solve=functools.partial(solve, transposed=True))
