@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array, lax
 
 LARGE = 40  # rows of a matrix, from which on a library that does one after the other is faster than all at once
+SMALL = 6  # rows of a matrix: those of one body in space
 FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
 
 
@@ -75,8 +76,8 @@ def rows(values: Array, index: tuple) -> Array:
 def sum_rows(values: Array, index: tuple) -> Array:
     """Sums of rows of values (M, ...), for an index known when tracing, (len(index), ...); M stands for nothing.
 
-    Where each sum is over a run of rows and one run follows the other, it is written out. Else rows are gathered, padded
-    to the most that any sum has: forward that is one fused loop, where a scatter is a serial one.
+    Where each sum is over a run of rows and one run follows the other, it is written out. Else rows are gathered,
+    padded to the most that any sum has: forward that is one fused loop, where a scatter is a serial one.
     """
     distinct = tuple(dict.fromkeys(index))
     runs = [tuple(i for i in row if i < len(values)) for row in distinct]
@@ -242,47 +243,24 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
 def solve_regular(matrix: Array, right: Array) -> Array:
     """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), without derivative.
 
-    Up to three rows by cofactors, up to six by two blocks of these. The upper block has to be regular too.
+    Up to SMALL rows no pivot is sought: such a matrix should be the unit matrix and one that is not negative.
     """
     matrix, right = lax.stop_gradient((matrix, right))
     if len(matrix) > LARGE:
         q, r = lax.linalg.qr(jnp.moveaxis(matrix, (0, 1), (-2, -1)))
         turned = jnp.swapaxes(q, -2, -1) @ jnp.moveaxis(right, (0, 1), (-2, -1))
         return jnp.moveaxis(lax.linalg.triangular_solve(r, turned, left_side=True), (-2, -1), (0, 1))
-    if len(matrix) <= 3:
-        return _product(_inverse_by_cofactors(matrix), right)
-    if len(matrix) > 6:
+    if len(matrix) > SMALL:
         return _gauss_jordan(matrix, right, jnp.zeros_like(matrix[0, 0]))
-    inverse = _inverse_by_cofactors(matrix[:3, :3])
-    across, upper = _product(inverse, matrix[:3, 3:]), _product(inverse, right[:3])
-    rest = _inverse_by_cofactors(matrix[3:, 3:] - _product(matrix[3:, :3], across))
-    lower = _product(rest, right[3:] - _product(matrix[3:, :3], upper))
-    return jnp.concatenate([upper - _product(across, lower), lower])
 
+    def eliminate(k, system):
+        column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
+        row = lax.dynamic_index_in_dim(system, k, 0, keepdims=False)
+        row = row * safe_divide(jnp.ones_like(row[0]), lax.dynamic_index_in_dim(column, k, 0, keepdims=False))[None]
+        others = lax.broadcasted_iota(np.int32, column.shape, 0) != k
+        return jnp.where(others[:, None], system - column[:, None] * row[None], row[None])
 
-def _product(a: Array, b: Array) -> Array:
-    """(I, J, *batch) times (J, K, *batch), written out."""
-    return functools.reduce(jnp.add, (a[:, j, None] * b[None, j] for j in range(a.shape[1])))
-
-
-def _inverse_by_cofactors(matrix: Array) -> Array:
-    """Inverse of (R, R, *batch), R up to 3; 0 where it is singular."""
-    m = [list(row) for row in matrix]
-    if len(m) == 1:
-        return safe_divide(jnp.ones_like(matrix), matrix)
-    if len(m) == 2:
-        (a, b), (c, d) = m
-        adjugate, det = [[d, -b], [-c, a]], a * d - b * c
-    else:
-        (a, b, c), (d, e, f), (g, h, i) = m
-        adjugate = [
-            [e * i - f * h, c * h - b * i, b * f - c * e],
-            [f * g - d * i, a * i - c * g, c * d - a * f],
-            [d * h - e * g, b * g - a * h, a * e - b * d],
-        ]
-        det = a * adjugate[0][0] + b * adjugate[1][0] + c * adjugate[2][0]
-    whole = components(*(components(*row) for row in adjugate))
-    return whole * safe_divide(jnp.ones_like(det), det)[None, None]
+    return lax.fori_loop(0, len(matrix), eliminate, jnp.concatenate([matrix, right], axis=1))[:, len(matrix) :]
 
 
 def identity(like: Array) -> Array:

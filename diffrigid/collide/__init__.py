@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from diffrigid.collide.contacts import Contacts
 from diffrigid.collide.convex import convex_convex
-from diffrigid.collide.halfspace import convex_halfspace, round_halfspace
+from diffrigid.collide.halfspace import box_halfspace, convex_halfspace, round_halfspace
 from diffrigid.collide.pairs import PairGroup, pair_groups
 from diffrigid.collide.profile import convex_profile
 from diffrigid.collide.round import round_round
@@ -27,6 +27,6 @@ COLLIDERS: dict[tuple[type, type], Callable[..., Contacts]] = {
 COLLIDERS |= {(a, HalfSpace): convex_halfspace for a in CONVEX_2D + CONVEX_3D}
 COLLIDERS |= {(a, Profile): convex_profile for a in CONVEX_2D}
 COLLIDERS |= {(Disc, Disc): round_round, (Sphere, Sphere): round_round}
-COLLIDERS |= {(Disc, HalfSpace): round_halfspace, (Sphere, HalfSpace): round_halfspace}
+COLLIDERS |= {(Disc, HalfSpace): round_halfspace, (Sphere, HalfSpace): round_halfspace, (Box, HalfSpace): box_halfspace}
 
 __all__ = ["COLLIDERS", "Contacts", "PairGroup", "pair_groups"]

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.collide import Contacts
 from diffrigid.contact.sides import (
+    Placed,
     Side,
     centre,
     contacts_of,
@@ -29,13 +29,12 @@ from diffrigid.contact.sides import (
     reach_of,
     relative_acceleration,
 )
-from diffrigid.numerics import FOUND, apart, dot, implicit_root, norm, safe_divide, safe_sqrt, softplus
-from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere
+from diffrigid.numerics import FOUND, apart, dot, fold, implicit_root, norm, safe_divide, safe_sqrt, softplus
+from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere, radius, vertices
 from diffrigid.state import rotations
 
 ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
 POLISH = 6  # steps along the local parabola of the gap; error squared by each
-HOP = 0.1  # [-] of the step: a near contact that opens for less is handed over as well
 NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over to polishing
 
 
@@ -200,15 +199,37 @@ def _approach_search(a: Side, b: Side, t1: Array, width: Array | None) -> tuple[
     return jnp.where(s < bound, start, s), level, found
 
 
-def _motion(a: Side, b: Side, s: Array, live: Array) -> tuple[Contacts, Array, Array]:
-    """Contacts at s, the rates of their gaps, (K, *batch) [m/s], and the accelerations of them [m/s^2]."""
+def _motion(a: Side, b: Side, s: Array, live: Array) -> tuple[Array, Array, Array, Array | None]:
+    """Gaps of the contacts at s, (K, *batch) [m], their rates [m/s] and accelerations [m/s^2], and their normals."""
     at_a, at_b = place(a, s, live), place(b, s, live)
+    if isinstance(b.shape, HalfSpace):
+        return *_corner_motion(a, at_a, b), None
     contacts = contacts_of(a, at_a, b, at_b)
 
     def pull(n, p):
         return dot(n, relative_acceleration(at_a, at_b, p))
 
-    return contacts, gap_rates(contacts, at_a, at_b), jax.vmap(pull)(contacts.normal, contacts.point)
+    acceleration = jax.vmap(pull)(contacts.normal, contacts.point)
+    return contacts.gap, gap_rates(contacts, at_a, at_b), acceleration, contacts.normal
+
+
+def _corner_motion(a: Side, at: Placed, b: Side) -> tuple[Array, Array, Array]:
+    """Heights of all corners of a above a half-space, (V, *batch) [m], their rates and accelerations.
+
+    In body axes the height of a corner r is n . x + N . r with N = R^T n; so are its derivatives, with those of N.
+    """
+    dim = len(at.x)
+    so = rotations(dim)
+    normal = so.rotate(b.q, b.shape.normal)
+    r = vertices(a.shape, dim)
+    r = r if a.offset is None else r + a.offset[None]
+    turning = so.cross(at.w, normal)
+    axes = [normal, -turning, so.cross(at.w, turning) - so.cross(at.dw, normal)]
+    heights = [dot(normal, at.x - b.x) - b.shape.offset - radius(a.shape), dot(normal, at.v), dot(normal, at.a)]
+    height, rate, acceleration = (
+        h[None] + jax.vmap(dot, (None, 0))(so.unrotate(at.q, n), r) for h, n in zip(heights, axes, strict=True)
+    )
+    return height, rate, acceleration
 
 
 def _time_to(height: Array, v: Array, acc: Array) -> Array:
@@ -233,19 +254,17 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
     live, span = jnp.any(t1 > 0), jnp.maximum(t1 - start, 0.0)
     (spin_a, jerk_a), (spin_b, jerk_b) = _unsteady(a, span), _unsteady(b, span)
     spinning, jerk = spin_a + spin_b, jerk_a + jerk_b
-    corners = isinstance(b.shape, HalfSpace)
 
     def safe_time(s):
-        contacts, v, acc = _motion(a, b, s, live)
-        if corners:
-            apart = _time_to(contacts.gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
+        gap, v, acc, normal = _motion(a, b, s, live)
+        if normal is None:
+            apart = _time_to(gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
         else:
             approach = centre(a, s)[1] - centre(b, s)[1]
-            bound = jnp.maximum(-(contacts.normal * approach[None]).sum(1), 0.0) + spinning[None]
-            apart = jnp.where(bound > 0, safe_divide(contacts.gap, bound), jnp.inf)
-        returns = _time_to(contacts.gap, v, acc)
-        returns = jnp.where(returns > HOP * span[None], returns, 0.0)  # negative where it closes
-        return jnp.where(contacts.gap > near[None], apart, returns).min(0)
+            bound = jnp.maximum(-(normal * approach[None]).sum(1), 0.0) + spinning[None]
+            apart = jnp.where(bound > 0, safe_divide(gap, bound), jnp.inf)
+        returns = jnp.where(v < 0, 0.0, _time_to(gap, v, acc))
+        return fold(jnp.minimum, jnp.where(gap > near[None], apart, returns), 0)
 
     def busy(carry):
         count, s, dt = carry
@@ -290,13 +309,13 @@ def _polish(
 
     def towards(carry):
         count, s, _, _, inside = carry
-        contacts, v, acc = _motion(a, b, s, live)
-        height = contacts.gap - level[None]
+        gap, v, acc, _ = _motion(a, b, s, live)
+        height = gap - level[None]
         there = (jnp.abs(height) <= 8.0 * slack**2 * size[None]) & (v < 0)  # to rounding
-        dt = jnp.where(there, 0.0, _time_to(height, v, acc)).min(0)
+        dt = fold(jnp.minimum, jnp.where(there, 0.0, _time_to(height, v, acc)), 0)
         dt = jnp.where(jnp.isfinite(dt) & ((dt < 0) | (s < t1 + slack * span)), dt, 0.0)  # what is later is no impact
-        at_level = (contacts.gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0))
-        inside = jnp.where(count == 0, ((contacts.gap <= level[None]) & (v < 0)).any(0), inside)
+        at_level = (gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0))
+        inside = jnp.where(count == 0, ((gap <= level[None]) & (v < 0)).any(0), inside)
         return count + 1, s + dt, dt, at_level.any(0), inside
 
     _, s, _, found, inside = lax.while_loop(busy, towards, (0, s, jnp.inf + s, s < s, s < s))
@@ -311,13 +330,8 @@ def _closest_level(a: Side, b: Side, s: Array, span: Array, width: Array, live: 
     """
     eta = 0.25 * span
 
-    def motion(a, b, s):
-        at_a, at_b = place(a, s, live), place(b, s, live)
-        contacts = contacts_of(a, at_a, b, at_b)
-        return contacts.gap, gap_rates(contacts, at_a, at_b)
-
     def least(a, b, s):
-        gaps, rates = jax.vmap(lambda t: motion(a, b, t))(jnp.stack([s - eta, s, s + eta]))
+        gaps, rates = jax.vmap(lambda t: _motion(a, b, t, live)[:2])(jnp.stack([s - eta, s, s + eta]))
         chosen = jax.nn.one_hot(jnp.argmin(gaps[1], 0), gaps.shape[1], axis=0, dtype=s.dtype)
         before, now, after = (chosen[None] * rates).sum(1)
         return (chosen * gaps[1]).sum(0), now, safe_divide(after - before, 2.0 * eta)
