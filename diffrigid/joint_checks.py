@@ -10,7 +10,7 @@ import numpy as np
 
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
 from diffrigid.joints import JOINTS, Distance, Pose, separation
-from diffrigid.linkage import jacobian
+from diffrigid.linkage import ends_of, jacobian, joint_rates
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
 from diffrigid.shapes import traced
@@ -133,9 +133,9 @@ def warn_of_torn_joints(world: Any, state: Any) -> None:
     def speeds(world: Any, state: Any) -> Any:
         parts = []
         for group in world.joints:
-            jac = jacobian((group,), world.statics, world.bodies, state)
-            rates = (jac.rows * jnp.concatenate([state.v, state.w], axis=1).reshape(1, -1)).sum(1)
-            parts.append(jnp.sqrt((rates.reshape(len(group.a), -1) ** 2).sum(1)))
+            jac = jacobian((group,), world.statics, state)
+            rates = joint_rates(jac.sides, ends_of((group,)), jnp.concatenate([state.v, state.w], axis=1))
+            parts.append(jnp.sqrt((rates**2).sum(1)))
         return jnp.concatenate(parts)
 
     rates = known(speeds, jax.tree.map(jnp.asarray, world), jax.tree.map(jnp.asarray, state))

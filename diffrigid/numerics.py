@@ -72,6 +72,17 @@ def rows(values: Array, index: tuple) -> Array:
     return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
+def rows_or_zeros(values: Array, index: tuple) -> Array:
+    """`rows`, where the index -1 stands for zeros."""
+    table = np.array(index)
+    if (table >= 0).all():
+        return rows(values, index)
+    some = np.maximum(table, 0).tolist()
+    chosen = rows(values, tuple(some if table.ndim == 1 else map(tuple, some)))
+    there = (constant(index, "int32") >= 0).reshape(*table.shape, *[1] * (chosen.ndim - table.ndim))
+    return jnp.where(there, chosen, 0.0)
+
+
 def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]], Any]]:
     """The leaves (M, ..., *batch) of a tree side by side, as one array (M, F, *batch) for each shape of the batch.
 
@@ -192,25 +203,6 @@ def normalise(a: Array, fallback: Array | None = None) -> Array:
     nonzero = square > 0
     unit = a / jnp.sqrt(jnp.where(nonzero, square, 1.0))[None]
     return jnp.where(nonzero[None], unit, jnp.zeros_like(a) if fallback is None else fallback)
-
-
-def solve_symmetric(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, for symmetric positive semidefinite matrices (R, R, *batch), (R, *batch) -> (R, *batch).
-
-    A direction in which the matrix is zero to rounding, as of a constraint that repeats others, is left out: x is
-    then one of many solutions, and finite. Gauss-Jordan in one loop, so that the batch stays the last axis; the
-    derivative is another solution.
-    """
-
-    def solve(matvec, right):
-        del matvec
-        rounding = 1e2 * jnp.finfo(matrix.dtype).eps * matrix.shape[0] * jnp.abs(matrix).max((0, 1))
-        return _gauss_jordan(matrix, right[:, None], rounding)[:, 0]
-
-    def product(x):
-        return (matrix * x[None]).sum(1)
-
-    return lax.custom_linear_solve(product, right, solve, symmetric=True)
 
 
 def inverse_matrix(matrix: Array) -> Array:
