@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.numerics import rows_or_zeros
+from diffrigid.numerics import apart, rows_or_zeros
 
 ROUNDING = 1e2  # times the spacing of numbers at the diagonal: a pivot of a loop that is no larger is zero
 
@@ -148,10 +148,10 @@ def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
     """All levels, from the blocks (n + pairs, E, E, *batch) of the joints with themselves, then of `plan.pairs`."""
     count, rounding = len(plan.places), 0.0 if plan.is_tree else ROUNDING * jnp.finfo(blocks.dtype).eps
     tiny = rounding * jnp.stack([blocks[:count, e, e] for e in range(blocks.shape[1])], axis=1)
-    factors = []
+    factors, live = [], jnp.ravel(blocks)[0] < jnp.inf
     for level in plan.levels:
         own = rows_or_zeros(blocks, level.blocks)
-        inverse, near = _inverse(own[:, 0], rows_or_zeros(tiny, level.pivots)), own[:, 1:]
+        inverse, near = apart(live, _inverse, own[:, 0], rows_or_zeros(tiny, level.pivots)), own[:, 1:]
         ready = _product(inverse[:, None], near, 2)
         factors.append(Factor(inverse, ready))
         if level.kept:
@@ -195,7 +195,7 @@ def _inverse(matrix: Array, tiny: Array) -> Array:
         rest = jnp.where(hit[:, :, None] | hit[:, None], 0.0, matrix)
         return rest + column[:, :, None] * row[:, None]
 
-    return -lax.fori_loop(0, matrix.shape[1], sweep, matrix)
+    return -lax.fori_loop(0, matrix.shape[1], sweep, matrix, unroll=matrix.shape[1] <= 3)
 
 
 def _product(a: Array, b: Array, axis: int) -> Array:

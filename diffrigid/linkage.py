@@ -22,7 +22,7 @@ from jax import Array, lax
 
 from diffrigid.elimination import Factor, factorise, plan, substitute
 from diffrigid.joints import Pose
-from diffrigid.numerics import dot, rows, rows_or_zeros
+from diffrigid.numerics import apart, dot, rows, rows_or_zeros
 from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import Bodies, State, Wrench, rotations
 
@@ -38,6 +38,10 @@ class Jacobian:
 
 def jacobian(joints: tuple, statics: Any, state: State) -> Jacobian:
     """Of all joints of a world, which are the rows of some records of many joints each."""
+    return apart(jnp.ravel(state.x)[0] < jnp.inf, functools.partial(_jacobian, joints, statics), state)
+
+
+def _jacobian(joints: tuple, statics: Any, state: State) -> Jacobian:
     so, batch = rotations(state.x.shape[1]), state.x.shape[2:]
 
     def row(joint: Any, a: Pose, b: Pose, v_a: Array, v_b: Array) -> tuple[Array, Array, Array]:
