@@ -10,7 +10,7 @@ import numpy as np
 
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
 from diffrigid.joints import JOINTS, Distance, Pose, separation
-from diffrigid.linkage import ends_of, jacobian, joint_rates
+from diffrigid.linkage import ends_of, joint_rates, placed, to_sides
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
 from diffrigid.shapes import traced
@@ -133,8 +133,9 @@ def warn_of_torn_joints(world: Any, state: Any) -> None:
     def speeds(world: Any, state: Any) -> Any:
         parts = []
         for group in world.joints:
-            jac = jacobian((group,), world.statics, state)
-            rates = joint_rates(jac.sides, ends_of((group,)), jnp.concatenate([state.v, state.w], axis=1))
+            at = placed((group,), world.statics, state.x, state.q)
+            twists = jnp.concatenate([state.v, state.w], axis=1)
+            rates = joint_rates(rotations(world.dim), at, to_sides(ends_of((group,)), twists))
             parts.append(jnp.sqrt((rates**2).sum(1)))
         return jnp.concatenate(parts)
 

@@ -6,15 +6,15 @@ With J the Jacobian of all errors by the twists (dx, dtheta) of the bodies and M
     J M^-1 J^T lam = -J v                    the impulses that bring velocities onto the joints
     J M^-1 J^T lam = -error                  the displacements that bring poses onto the joints
 
-J and the rate of J v are derivatives of the error function in forward mode. All of it is differentiable in both
-modes, by anchors, axes and lengths too, except where a rod has no length.
+J u, the rate of J v and J^T lam are derivatives of the error function. All of it is differentiable in both modes, by
+anchors, axes and lengths too, except where a rod has no length.
 Source: Witkin, Physically Based Modeling: Constrained Dynamics, SIGGRAPH 1997 course notes, sections 2 to 4.
 """
 
 import functools
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,87 +27,118 @@ from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import Bodies, State, Wrench, rotations
 
 
-@pytree
-class Jacobian:
-    """J of n joints by blocks, one for each of the two bodies of a joint; those with fewer errors have rows of zeros."""
+class Placed(NamedTuple):
+    """Joints of one kind, without names, and the poses of their bodies; every leaf with a leading axis M."""
 
-    sides: Array = array("n", "2", "E", "D + A")  # by the twists (dx, dtheta) of bodies a and b
-    error: Array = array("n", "E")  # [m or rad]
-    rate: Array = array("n", "E")  # dJ/dt v [m/s^2 or rad/s^2]
-
-
-def jacobian(joints: tuple, statics: Any, state: State) -> Jacobian:
-    """Of all joints of a world, which are the rows of some records of many joints each."""
-    return apart(jnp.ravel(state.x)[0] < jnp.inf, functools.partial(_jacobian, joints, statics), state)
+    joint: Any
+    a: Pose
+    b: Pose
 
 
-def _jacobian(joints: tuple, statics: Any, state: State) -> Jacobian:
-    so, batch = rotations(state.x.shape[1]), state.x.shape[2:]
-
-    def row(joint: Any, a: Pose, b: Pose, v_a: Array, v_b: Array) -> tuple[Array, Array, Array]:
-        error, rate, by_twists = differentiated(so, lambda a, b: joint(so, a, b), a, b, v_a, v_b)
-        by_sides = by_twists.reshape(len(error), 2, so.D + so.A, *batch)
-        return error, rate, jnp.swapaxes(by_sides, 0, 1)
-
-    parts = [_of_each(row, group, statics, state) for group in joints]
-    most = max(error.shape[1] for error, _, _ in parts)
-
-    def together(leaves: tuple[Array, ...], axis: int) -> Array:
-        def filled(leaf):
-            return jnp.pad(leaf, [(0, (most - leaf.shape[axis]) * (k == axis)) for k in range(leaf.ndim)])
-
-        return jnp.concatenate([leaf if leaf.shape[axis] == most else filled(leaf) for leaf in leaves])
-
-    error, rate, sides = zip(*parts, strict=True)
-    return Jacobian(error=together(error, 1), rate=together(rate, 1), sides=together(sides, 2))
+def placed(joints: tuple, statics: Any, x: Array, q: Array) -> tuple[Placed, ...]:
+    """All joints of a world whose bodies have poses x (N, D, *batch), q (N, Q, *batch)."""
+    every = _poses(statics, x, q)
+    return tuple(
+        Placed(replace(group, a=None, b=None), *(jax.tree.map(lambda leaf, ends=ends: rows(leaf, ends), every) for ends in (group.a, group.b)))
+        for group in joints
+    )
 
 
-def _of_each(row: Callable, group: Any, statics: Any, state: State) -> Any:
-    """`row(joint, pose_a, pose_b, twist_a, twist_b)` of every joint of a group."""
-    twist, poses = _twists(state), (_poses(statics, state, ends) for ends in (group.a, group.b))
-    still = jnp.zeros((len(statics.x) + 1, *twist.shape[1:]), twist.dtype)
-    twists = (rows(jnp.concatenate([twist, still]), ends) for ends in (group.a, group.b))
-    return jax.vmap(row)(replace(group, a=None, b=None), *poses, *twists)
+def _poses(statics: Any, x: Array, q: Array) -> Pose:
+    """Of colliders: bodies, then statics, then the world, which stands at the origin."""
+    batch = x.shape[2:]
+    still = [jnp.broadcast_to(leaf, leaf.shape[:2] + batch) for leaf in (statics.x, statics.q)]
+    world = jnp.zeros_like(x[:1]), jnp.zeros_like(q[:1]).at[:, 0].set(1.0)
+    return Pose(*(jnp.concatenate(parts) for parts in zip((x, q), still, world, strict=True)))
 
 
-def _twists(state: State) -> Array:
-    """(N, D + A, *batch)."""
-    return jnp.concatenate([state.v, state.w], axis=1)
+def _of_each(row: Callable, groups: tuple[Placed, ...], *args: Array) -> Array:
+    """`row(joint, a, b, *args)` of all n joints, (n, E, *batch), for args (n, ...); filled up with zeros to E numbers."""
+    parts, start = [], 0
+    for group in groups:
+        count = len(group.a.x)
+        parts.append(jax.vmap(row)(*group, *(arg[start : start + count] for arg in args)))
+        start += count
+    most = max(part.shape[1] for part in parts)
+
+    def filled(part):
+        return jnp.pad(part, [(0, (most - part.shape[1]) * (axis == 1)) for axis in range(part.ndim)])
+
+    return jnp.concatenate([part if part.shape[1] == most else filled(part) for part in parts])
 
 
-def differentiated(
-    so: ModuleType, of: Callable, a: Pose, b: Pose, v_a: Array, v_b: Array
-) -> tuple[Array, Array, Array]:
-    """What a function of the poses of two bodies is, and how it changes with their motion.
+def _change(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array) -> Array:
+    """Rate of a function of(a, b) of the poses of two bodies, for their twists u (2, D + A, *batch)."""
+    return jax.jvp(of, (a, b), _tangents(so, a, b, u))[1]
+
+
+def _tangents(so: ModuleType, a: Pose, b: Pose, u: Array) -> tuple[Pose, Pose]:
+    one, other = (Pose(v[: so.D], so.rate(v[so.D :], pose.q)) for v, pose in zip(u, (a, b), strict=True))
+    return one, other
+
+
+def _acceleration(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array, du: Array) -> Array:
+    """Second derivative by time of a function of(a, b), for twists u and their rates du (2, D + A, *batch)."""
+    rate = functools.partial(_change, so, of)
+    return jax.jvp(rate, (a, b, u), (*_tangents(so, a, b, u), du))[1]
+
+
+def by_twists(so: ModuleType, of: Callable, a: Pose, b: Pose) -> Array:
+    """Jacobian of a function of(a, b) -> (E, *batch) by the twists of a, then b, (E, 2 (D + A), *batch)."""
+    n, batch = so.D + so.A, a.x.shape[1:]
+    units = jnp.eye(2 * n, dtype=a.x.dtype).reshape(2 * n, 2, n, *[1] * len(batch)) + jnp.zeros_like(a.x[:1])
+    return jax.vmap(lambda unit: _change(so, of, a, b, unit), out_axes=1)(units)
+
+
+def _held(so: ModuleType, joint: Any) -> Callable:
+    return lambda a, b: joint(so, a, b)
+
+
+def _errors(so: ModuleType, groups: tuple[Placed, ...]) -> Array:
+    """(n, E, *batch) [m or rad]."""
+    return _of_each(lambda joint, a, b: joint(so, a, b), groups)
+
+
+def joint_rates(so: ModuleType, groups: tuple[Placed, ...], twists: Array) -> Array:
+    """J u for the twists u of the bodies of all joints, (n, 2, D + A, *batch) -> (n, E, *batch) [m/s or rad/s]."""
+    return _of_each(lambda joint, a, b, u: _change(so, _held(so, joint), a, b, u), groups, twists)
+
+
+def _accelerations(so: ModuleType, groups: tuple[Placed, ...], twists: Array, rates: Array) -> Array:
+    """J du + dJ/dt u for twists u that change at rates du, (n, E, *batch) [m/s^2 or rad/s^2]."""
+
+    def row(joint: Any, a: Pose, b: Pose, u: Array, du: Array) -> Array:
+        return _acceleration(so, _held(so, joint), a, b, u, du)
+
+    return _of_each(row, groups, twists, rates)
+
+
+def _jacobian(so: ModuleType, groups: tuple[Placed, ...]) -> Array:
+    """J by blocks, one for each of the two bodies of each joint, (n, E, 2, D + A, *batch)."""
+    flat = _of_each(lambda joint, a, b: by_twists(so, _held(so, joint), a, b), groups)
+    return flat.reshape(*flat.shape[:2], 2, so.D + so.A, *flat.shape[3:])
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _forces(so: ModuleType, sides: Array, groups: tuple[Placed, ...], lam: Array) -> Array:
+    """J^T lam on the two bodies of each joint, (n, 2, D + A, *batch), for multipliers (n, E, *batch).
 
     Args:
-        of: (a, b) -> (E, *batch).
-        v_a, v_b: (D + A, *batch) twists of the bodies.
-
-    Returns:
-        its value (E, *batch); its acceleration (E, *batch) while the twists stay; and its Jacobian by the twists of
-        a, then b, (E, 2 (D + A), *batch).
+        sides: J as `_jacobian` has it. Not differentiated: the derivative of J^T lam is that of the transpose of J u,
+            which takes a fraction of the derivative of all columns of J.
     """
-    n, batch = so.D + so.A, a.x.shape[1:]
-
-    def change(poses, v):  # for twists v (2, D + A) of the two bodies
-        tangent = tuple(Pose(u[: so.D], so.rate(u[so.D :], pose.q)) for u, pose in zip(v, poses, strict=True))
-        return jax.jvp(lambda poses: of(*poses), (poses,), (tangent,))[1]
-
-    v, poses = jnp.stack([v_a, v_b]), (a, b)
-    tangent = tuple(Pose(u[: so.D], so.rate(u[so.D :], pose.q)) for u, pose in zip(v, poses, strict=True))
-    second = jax.jvp(lambda poses: change(poses, v), (poses,), (tangent,))[1]
-    units = jnp.eye(2 * n, dtype=v.dtype).reshape(2 * n, 2, n, *[1] * len(batch)) + jnp.zeros_like(v)[None]
-    return of(a, b), second, jax.vmap(lambda unit: change(poses, unit), out_axes=1)(units)
+    del groups
+    return sum(sides[:, e] * lam[:, e, None, None] for e in range(lam.shape[1]))
 
 
-def _poses(statics: Any, state: State, ends: tuple[int, ...]) -> Pose:
-    """Of colliders: bodies, then statics, then the world, which stands at the origin."""
-    batch = state.x.shape[2:]
-    still = [jnp.broadcast_to(leaf, leaf.shape[:2] + batch) for leaf in (statics.x, statics.q)]
-    world = jnp.zeros_like(state.x[:1]), jnp.zeros_like(state.q[:1]).at[:, 0].set(1.0)
-    x, q = (jnp.concatenate(parts) for parts in zip((state.x, state.q), still, world, strict=True))
-    return Pose(rows(x, ends), rows(q, ends))
+@_forces.defjvp
+def _forces_jvp(so, primals, tangents):
+    def transposed(groups, lam):
+        like = jax.eval_shape(functools.partial(_forces, so), *primals)
+        back = jax.linear_transpose(functools.partial(joint_rates, so, groups), like)
+        return back(lam)[0]
+
+    return _forces(so, *primals), jax.jvp(transposed, primals[1:], tangents[1:])[1]
 
 
 def islands(joints: tuple, moving: int) -> tuple[tuple[int, ...], ...]:
@@ -131,67 +162,65 @@ def ends_of(joints: Any) -> tuple[tuple[int, int], ...]:
 class Linkage:
     """How the n joints of a world act on its N moving bodies."""
 
-    sides: Array = array("n", "2", "E", "D + A")  # J, as in `Jacobian`
-    mobile: Array = array("n", "2", "E", "D + A")  # J M^-1
+    groups: tuple[Placed, ...] = ()
+    sides: Array = array("n", "E", "2", "D + A")  # J, without derivative
     factors: tuple[Factor, ...] = ()  # of J M^-1 J^T, without derivative
+    inverse_mass: Array = array("N")  # [1/kg]
+    inverse_inertia: Array = array("N")  # [1/(kg m^2)] world axes
     ends: tuple[tuple[int, int], ...] = static()  # colliders a and b of every joint
-    moving: int = static()
 
 
-def linkage(joints: tuple, bodies: Bodies, q: Array, sides: Array) -> Linkage:
-    """Of the joints of a world whose bodies have orientations q, from their Jacobian."""
-    so, moving = rotations(bodies.dim), len(q)
-    ends = ends_of(joints)
+def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> Linkage:
+    """Of the joints of a world at these poses (N, D, *batch), (N, Q, *batch)."""
+    so, ends = rotations(bodies.dim), ends_of(joints)
+    groups, live = placed(joints, statics, x, q), jnp.ravel(x)[0] < jnp.inf
     inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q)
-    still = tuple(tuple(min(end, moving) for end in pair) for pair in ends)
-    inverse, inverse_mass = (
-        rows(jnp.concatenate([leaf, jnp.zeros_like(leaf[:1])]), still) for leaf in (inverse, 1.0 / bodies.mass)
+    inverse_mass = 1.0 / bodies.mass
+    sides = apart(live, functools.partial(_jacobian, so), lax.stop_gradient(groups))
+    blocks = _blocks(so, ends, sides, *lax.stop_gradient((inverse_mass, inverse)))
+    return Linkage(
+        groups=groups, sides=sides, factors=factorise(plan(ends, len(x)), blocks), inverse_mass=inverse_mass,
+        inverse_inertia=inverse, ends=ends,
+    )  # fmt: skip
+
+
+def _blocks(so: ModuleType, ends: tuple[tuple[int, int], ...], sides: Array, mass: Array, inertia: Array) -> Array:
+    """Of J M^-1 J^T, as `factorise` takes them: (n + pairs, E, E, *batch), from inverse masses and inertias."""
+    moving, sides = len(mass), jnp.swapaxes(sides, 1, 2)
+    inertia, mass = (
+        rows_or_zeros(leaf, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
+        for leaf in (inertia, mass)
     )
 
-    def moved(inverse: Array, inverse_mass: Array, row: Array) -> Array:
-        return jnp.concatenate([inverse_mass * row[: so.D], so.apply(inverse, row[so.D :])])
+    def moved(inertia: Array, mass: Array, row: Array) -> Array:
+        return jnp.concatenate([mass[None] * row[: so.D], so.apply(inertia, row[so.D :])])
 
-    mobile = jax.vmap(jax.vmap(jax.vmap(moved, (None, None, 0))))(inverse, inverse_mass, sides)
-    factors = factorise(plan(ends, moving), lax.stop_gradient(_blocks(ends, moving, sides, mobile)))
-    return Linkage(sides=sides, mobile=mobile, factors=factors, ends=ends, moving=moving)
-
-
-def _blocks(ends: tuple[tuple[int, int], ...], moving: int, sides: Array, mobile: Array) -> Array:
-    """Of J M^-1 J^T, as `factorise` takes them: (n + pairs, E, E, *batch)."""
+    mobile = jax.vmap(jax.vmap(jax.vmap(moved, (None, None, 0))))(inertia, mass, sides)
     entry = jax.vmap(jax.vmap(jax.vmap(dot, (None, 0)), (0, None)))
-    blocks = [entry(sides[:, 0], mobile[:, 0]) + entry(sides[:, 1], mobile[:, 1])]
-    flat, flat_mobile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (sides, mobile))
-    pairs = plan(ends, moving).pairs
-    if pairs:
-        shared = [
-            [(2 * i + s, 2 * j + t) for s in (0, 1) for t in (0, 1) if ends[i][s] == ends[j][t] < moving]
-            for i, j in pairs
-        ]
-        first = tuple(found[0][0] for found in shared), tuple(found[0][1] for found in shared)
-        between = entry(rows(flat, first[0]), rows(flat_mobile, first[1]))
-        twice = [found[-1] if len(found) > 1 else (-1, -1) for found in shared]
-        if max(twice) > (-1, -1):
-            second = entry(*(rows_or_zeros(leaf, tuple(pair[k] for pair in twice)) for k, leaf in enumerate((flat, flat_mobile))))
-            between = between + second
-        blocks.append(between)
-    return jnp.concatenate(blocks)
+    own = entry(sides[:, 0], mobile[:, 0]) + entry(sides[:, 1], mobile[:, 1])
+    sides, mobile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (sides, mobile))
+    shared = [entry(rows_or_zeros(sides, i), rows_or_zeros(mobile, j)) for i, j in _shared(ends, moving)]
+    return jnp.concatenate([own, functools.reduce(jnp.add, shared)]) if shared else own
 
 
-def joint_rates(sides: Array, ends: tuple[tuple[int, int], ...], twist: Array) -> Array:
-    """J u for the twists of all bodies (N, D + A, *batch), (n, E, *batch)."""
-    padded = jnp.concatenate([twist, jnp.zeros_like(twist[:1])])
-    by_sides = rows(padded, tuple(tuple(min(end, len(twist)) for end in pair) for pair in ends))
-    each = jax.vmap(jax.vmap(dot, (0, None)))  # of a joint: its rows
-    return each(sides[:, 0], by_sides[:, 0]) + each(sides[:, 1], by_sides[:, 1])
+@functools.cache
+def _shared(ends: tuple[tuple[int, int], ...], moving: int) -> tuple:
+    """For each pair of coupled joints the sides that are on one body, 2 i + s for side s of joint i; twice where both are."""
+    found = [
+        [(2 * i + s, 2 * j + t) for s in (0, 1) for t in (0, 1) if ends[i][s] == ends[j][t] < moving]
+        for i, j in plan(ends, moving).pairs
+    ]
+    most = max(map(len, found), default=0)
+    return tuple(tuple(zip(*((some + [(-1, -1)])[k] for some in found), strict=True)) for k in range(most))
 
 
-def _on_bodies(link: Linkage, sides: Array, lam: Array) -> Array:
-    """Sum over its joints of what every body gets by multipliers (n, E, *batch): forces, or twists of `mobile`."""
-    each = sum(sides[:, :, e] * lam[:, None, None, e] for e in range(lam.shape[1]))
-    return _by_body(each, link.ends, link.moving)
+def to_sides(ends: tuple[tuple[int, int], ...], twists: Array) -> Array:
+    """Twists of bodies (N, D + A, *batch) at the two ends of every joint, (n, 2, D + A, *batch)."""
+    moving = len(twists)
+    return rows_or_zeros(twists, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
 
 
-def _by_body(by_sides: Array, ends: tuple[tuple[int, int], ...], moving: int) -> Array:
+def _by_body(ends: tuple[tuple[int, int], ...], moving: int, by_sides: Array) -> Array:
     """What both bodies of every joint get (n, 2, ...), summed over the joints of every moving body, (N, ...)."""
     return rows_or_zeros(by_sides.reshape(-1, *by_sides.shape[2:]), _sides_of(ends, moving)).sum(1)
 
@@ -204,14 +233,33 @@ def _sides_of(ends: tuple[tuple[int, int], ...], moving: int) -> tuple[tuple[int
     return tuple(tuple(own + [-1] * (most - len(own))) for own in sides)
 
 
+def _rates(link: Linkage, twists: Array) -> Array:
+    """J u for the twists u of all bodies (N, D + A, *batch), (n, E, *batch)."""
+    so = rotations(link.groups[0].a.x.shape[1])
+    return joint_rates(so, link.groups, to_sides(link.ends, twists))
+
+
+def _pull(link: Linkage, lam: Array) -> Array:
+    """J^T lam on all bodies, (N, D + A, *batch)."""
+    so = rotations(link.groups[0].a.x.shape[1])
+    return _by_body(link.ends, len(link.inverse_mass), _forces(so, link.sides, link.groups, lam))
+
+
+def _moved(link: Linkage, forces: Array) -> Array:
+    """M^-1 times forces and torques (N, D + A, *batch)."""
+    so = rotations(link.groups[0].a.x.shape[1])
+    turn = jax.vmap(so.apply)(link.inverse_inertia, forces[:, so.D :])
+    return jnp.concatenate([link.inverse_mass[:, None] * forces[:, : so.D], turn], axis=1)
+
+
 def _multipliers(link: Linkage, target: Array) -> Array:
     """lam of J M^-1 J^T lam = -target, for targets (n, E, *batch)."""
 
     def product(lam: Array) -> Array:
-        return joint_rates(link.sides, link.ends, _on_bodies(link, link.mobile, lam))
+        return _rates(link, _moved(link, _pull(link, lam)))
 
     def solve(_, right: Array) -> Array:
-        return substitute(plan(link.ends, link.moving), link.factors, right)
+        return substitute(plan(link.ends, len(link.inverse_mass)), link.factors, right)
 
     return lax.custom_linear_solve(product, -target, solve, symmetric=True)
 
@@ -219,40 +267,46 @@ def _multipliers(link: Linkage, target: Array) -> Array:
 def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
     """Changes of v, w and L that the joints add to changes dv (N, D, *batch), dw (N, A, *batch) of free bodies."""
     D = dv.shape[1]
-    lam = _multipliers(link, joint_rates(link.sides, link.ends, jnp.concatenate([dv, dw], axis=1)))
-    moved, forced = _on_bodies(link, link.mobile, lam), _on_bodies(link, link.sides, lam)
+    forced = _pull(link, _multipliers(link, _rates(link, jnp.concatenate([dv, dw], axis=1))))
+    moved = _moved(link, forced)
     return moved[:, :D], moved[:, D:], forced[:, D:]
 
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench) -> Wrench:
     """The forces of a world with those added that keep its joints."""
-    so = rotations(bodies.dim)
-    jac = jacobian(joints, statics, state)
-    link = linkage(joints, bodies, state.q, jac.sides)
-    damped = _damping(joints, statics, state)
-    F = wrench.F if damped is None else wrench.F + damped[:, : so.D]
-    tau = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
-    tau = tau if damped is None else tau + damped[:, so.D :]
+    so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
+    torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
+    given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1))
     gyroscopic = jax.vmap(so.gyroscopic)(bodies.inertia, state.q, state.w)
-    inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), state.q)
-    free = jnp.concatenate([F / bodies.mass[:, None], jax.vmap(so.apply)(inverse, tau - gyroscopic)], axis=1)
-    forces = _on_bodies(link, link.sides, _multipliers(link, joint_rates(link.sides, link.ends, free) + jac.rate))
-    return Wrench(F=F + forces[:, : so.D], tau=tau + forces[:, so.D :])
+    free = _moved(link, given.at[:, so.D :].add(-gyroscopic) if so.D == 3 else given)
+
+    def falling(groups: tuple[Placed, ...], twists: Array, free: Array) -> Array:
+        return _accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
+
+    target = apart(jnp.ravel(free)[0] < jnp.inf, falling, link.groups, _twists(state), free)
+    forces = given + _pull(link, _multipliers(link, target))
+    return Wrench(F=forces[:, : so.D], tau=forces[:, so.D :])
 
 
-def _damping(joints: tuple, statics: Any, state: State) -> Array | None:
-    """Forces and torques of the damping of joints, (N, D + A, *batch)."""
-    so, damped = rotations(state.x.shape[1]), [group for group in joints if getattr(group, "damping", None) is not None]
+def _twists(state: State) -> Array:
+    """(N, D + A, *batch)."""
+    return jnp.concatenate([state.v, state.w], axis=1)
 
-    def resisting(joint: Any, a: Pose, b: Pose, v_a: Array, v_b: Array) -> Array:
-        along = differentiated(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b, v_a, v_b)[2][0]
-        forces = -joint.damping * (along * jnp.concatenate([v_a, v_b])).sum(0) * along
-        return forces.reshape(2, so.D + so.A, *forces.shape[1:])
 
-    if not damped:
-        return None
-    forces = jnp.concatenate([_of_each(resisting, group, statics, state) for group in damped])
-    return _by_body(forces, ends_of(damped), len(state.x))
+def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array) -> Array:
+    """Forces and torques on all bodies (N, D + A, *batch) with those added of the damping of joints."""
+    so = rotations(link.groups[0].a.x.shape[1])
+
+    def resisting(joint: Any, a: Pose, b: Pose, u: Array) -> Array:
+        along = by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0].reshape(u.shape)
+        return -joint.damping * (along * u).sum((0, 1)) * along
+
+    for group, at in zip(joints, link.groups, strict=True):
+        if getattr(group, "damping", None) is not None:
+            ends = ends_of((group,))
+            resistance = _of_each(resisting, (at,), to_sides(ends, twists))
+            forces = forces + _by_body(ends, len(forces), resistance)
+    return forces
 
 
 def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> State:
@@ -260,9 +314,10 @@ def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> St
 
     Both by J at the poses as they come, so that the velocities are then on the joints up to the displacement.
     """
-    so = rotations(bodies.dim)
-    jac = jacobian(joints, statics, state)
-    link = linkage(joints, bodies, state.q, jac.sides)
-    moved, kicked = (_on_bodies(link, link.mobile, _multipliers(link, off)) for off in (jac.error, joint_rates(link.sides, link.ends, _twists(state))))
+    so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
+    moved, kicked = (
+        _moved(link, _pull(link, _multipliers(link, off)))
+        for off in (_errors(so, link.groups), _rates(link, _twists(state)))
+    )
     q = jax.vmap(so.turn_by)(moved[:, so.D :], state.q)
-    return replace(state, x=state.x + moved[:, : so.D], q=q, v=state.v + kicked[:, : so.D], w=state.w + kicked[:, so.D :])
+    return State(x=state.x + moved[:, : so.D], q=q, v=state.v + kicked[:, : so.D], w=state.w + kicked[:, so.D :])

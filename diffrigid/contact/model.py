@@ -33,7 +33,7 @@ from diffrigid.contact.sides import at_colliders, body_sides, side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, is_rolling, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
-from diffrigid.linkage import islands, jacobian, linkage, spread
+from diffrigid.linkage import islands, linkage, spread
 from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
@@ -252,9 +252,7 @@ def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility]:
     q, so = jax.vmap(orientation)(flight, t), rotations(flight.dim)
     inverse, link = jax.vmap(so.world_inverse)(flight.inverse_inertia, q), None
     if world.joints:
-        still = jnp.zeros_like(flight.v)
-        state = State(x=jax.vmap(position)(flight, t), q=q, v=still, w=jnp.zeros_like(flight.L))
-        link = linkage(world.joints, world.bodies, q, jacobian(world.joints, world.statics, state).sides)
+        link = linkage(world.joints, world.statics, world.bodies, jax.vmap(position)(flight, t), q)
     return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse, link=link)
 
 
