@@ -274,6 +274,7 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench) -> Wrench:
     """The forces of a world with those added that keep its joints."""
+    state = apart(jnp.ravel(state.x)[0] < jnp.inf, lambda state: state, state)
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
     given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1))
@@ -314,10 +315,9 @@ def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> St
 
     Both by J at the poses as they come, so that the velocities are then on the joints up to the displacement.
     """
+    state = apart(jnp.ravel(state.x)[0] < jnp.inf, lambda state: state, state)
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
-    moved, kicked = (
-        _moved(link, _pull(link, _multipliers(link, off)))
-        for off in (_errors(so, link.groups), _rates(link, _twists(state)))
-    )
+    off = jnp.stack([_errors(so, link.groups), _rates(link, _twists(state))])
+    moved, kicked = jax.vmap(lambda off: _moved(link, _pull(link, _multipliers(link, off))))(off)
     q = jax.vmap(so.turn_by)(moved[:, so.D :], state.q)
     return State(x=state.x + moved[:, : so.D], q=q, v=state.v + kicked[:, : so.D], w=state.w + kicked[:, so.D :])
