@@ -86,7 +86,8 @@ def _acceleration(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array, du: 
 def by_twists(so: ModuleType, of: Callable, a: Pose, b: Pose) -> Array:
     """Jacobian of a function of(a, b) -> (E, *batch) by the twists of a, then b, (E, 2 (D + A), *batch)."""
     n, batch = so.D + so.A, a.x.shape[1:]
-    units = jnp.eye(2 * n, dtype=a.x.dtype).reshape(2 * n, 2, n, *[1] * len(batch)) + jnp.zeros_like(a.x[:1])
+    units = jnp.eye(2 * n, dtype=a.x.dtype).reshape(2 * n, 2, n, *[1] * len(batch))
+    units = units + jnp.zeros_like(a.x[:1])[None, None]
     return jax.vmap(lambda unit: _change(so, of, a, b, unit), out_axes=1)(units)
 
 
