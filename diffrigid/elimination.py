@@ -88,7 +88,8 @@ def _level(pivots, blocks, left, later, first) -> tuple[Level, list, list]:
     """A level, and the blocks and rows that are left after it."""
     near = {i: sorted({j for pair in blocks if i in pair for j in pair} - {i}, key=first) for i in pivots}
     most = max(map(len, near.values()))
-    products, row_products = {}, {}
+    products: dict[tuple[int, int], list[int]] = {}
+    row_products: dict[int, list[int]] = {}
     for p, i in enumerate(pivots):
         for s, j in enumerate(near[i]):
             row_products.setdefault(j, []).append(p * most + s)
@@ -172,12 +173,12 @@ def substitute(plan: Plan, factors: tuple[Factor, ...], right: Array) -> Array:
             taken = _product(jnp.swapaxes(factor.near, 2, 3), own[:, None], 2)
             taken = taken.reshape(-1, *taken.shape[2:])
             right = _less(rows_or_zeros(right, level.kept_rows), taken, level.row_sums)
-    x = None
+    x = right[:0]
     for level, factor, own in list(zip(plan.levels, factors, pivots, strict=True))[::-1]:
         found = _product(factor.inverse, own, 1)
         if level.after[0]:
             found = found - _product(factor.near, rows_or_zeros(x, level.after), 2).sum(1)
-        x = found if x is None else jnp.concatenate([x, found])
+        x = jnp.concatenate([x, found])
     return rows_or_zeros(x, plan.places)[:, :, 0]
 
 
@@ -199,12 +200,12 @@ def _inverse(matrix: Array, tiny: Array) -> Array:
 
 
 def _product(a: Array, b: Array, axis: int) -> Array:
-    """Products of matrices with rows on `axis` and columns behind, term by term: a sum over an axis is not vectorised."""
-    total = None
-    for k in range(b.shape[axis]):
-        column, row = (lax.slice_in_dim(m, k, k + 1, axis=at) for m, at in ((a, axis + 1), (b, axis)))
-        total = column * row if total is None else total + column * row
-    return total
+    """Products of matrices with rows on `axis`, columns behind. Term by term: XLA does not vectorise a short sum."""
+
+    def term(k):
+        return lax.slice_in_dim(a, k, k + 1, axis=axis + 1) * lax.slice_in_dim(b, k, k + 1, axis=axis)
+
+    return functools.reduce(jnp.add, map(term, range(b.shape[axis])))
 
 
 def _less(values: Array, taken: Array, sums: tuple[tuple[int, ...], ...]) -> Array:

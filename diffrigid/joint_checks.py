@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.constraints import joint_rates, placed
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
 from diffrigid.joints import JOINTS, Distance, Pose, separation
-from diffrigid.linkage import ends_of, joint_rates, placed, to_sides
+from diffrigid.linkage import ends_of, to_sides
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
 from diffrigid.shapes import traced

@@ -6,140 +6,34 @@ With J the Jacobian of all errors by the twists (dx, dtheta) of the bodies and M
     J M^-1 J^T lam = -J v                    the impulses that bring velocities onto the joints
     J M^-1 J^T lam = -error                  the displacements that bring poses onto the joints
 
-J u, the rate of J v and J^T lam are derivatives of the error function. All of it is differentiable in both modes, by
-anchors, axes and lengths too, except where a rod has no length.
+All of it is differentiable in both modes, by anchors, axes and lengths too, except where a rod has no length.
 Source: Witkin, Physically Based Modeling: Constrained Dynamics, SIGGRAPH 1997 course notes, sections 2 to 4.
 """
 
 import functools
-from collections.abc import Callable
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.constraints import (
+    Placed,
+    by_twists,
+    joint_accelerations,
+    joint_errors,
+    joint_forces,
+    joint_jacobian,
+    joint_rates,
+    of_each,
+    placed,
+)
 from diffrigid.elimination import Factor, factorise, plan, substitute
 from diffrigid.joints import Pose
-from diffrigid.numerics import apart, dot, rows, rows_or_zeros
-from diffrigid.pytree import array, pytree, replace, static
+from diffrigid.numerics import apart, dot, rows_or_zeros
+from diffrigid.pytree import array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, rotations
-
-
-class Placed(NamedTuple):
-    """Joints of one kind, without names, and the poses of their bodies; every leaf with a leading axis M."""
-
-    joint: Any
-    a: Pose
-    b: Pose
-
-
-def placed(joints: tuple, statics: Any, x: Array, q: Array) -> tuple[Placed, ...]:
-    """All joints of a world whose bodies have poses x (N, D, *batch), q (N, Q, *batch)."""
-    every = _poses(statics, x, q)
-    return tuple(
-        Placed(replace(group, a=None, b=None), *(jax.tree.map(lambda leaf, ends=ends: rows(leaf, ends), every) for ends in (group.a, group.b)))
-        for group in joints
-    )
-
-
-def _poses(statics: Any, x: Array, q: Array) -> Pose:
-    """Of colliders: bodies, then statics, then the world, which stands at the origin."""
-    batch = x.shape[2:]
-    still = [jnp.broadcast_to(leaf, leaf.shape[:2] + batch) for leaf in (statics.x, statics.q)]
-    world = jnp.zeros_like(x[:1]), jnp.zeros_like(q[:1]).at[:, 0].set(1.0)
-    return Pose(*(jnp.concatenate(parts) for parts in zip((x, q), still, world, strict=True)))
-
-
-def _of_each(row: Callable, groups: tuple[Placed, ...], *args: Array) -> Array:
-    """`row(joint, a, b, *args)` of all n joints, (n, E, *batch), for args (n, ...); filled up with zeros to E numbers."""
-    parts, start = [], 0
-    for group in groups:
-        count = len(group.a.x)
-        parts.append(jax.vmap(row)(*group, *(arg[start : start + count] for arg in args)))
-        start += count
-    most = max(part.shape[1] for part in parts)
-
-    def filled(part):
-        return jnp.pad(part, [(0, (most - part.shape[1]) * (axis == 1)) for axis in range(part.ndim)])
-
-    return jnp.concatenate([part if part.shape[1] == most else filled(part) for part in parts])
-
-
-def _change(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array) -> Array:
-    """Rate of a function of(a, b) of the poses of two bodies, for their twists u (2, D + A, *batch)."""
-    return jax.jvp(of, (a, b), _tangents(so, a, b, u))[1]
-
-
-def _tangents(so: ModuleType, a: Pose, b: Pose, u: Array) -> tuple[Pose, Pose]:
-    one, other = (Pose(v[: so.D], so.rate(v[so.D :], pose.q)) for v, pose in zip(u, (a, b), strict=True))
-    return one, other
-
-
-def _acceleration(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array, du: Array) -> Array:
-    """Second derivative by time of a function of(a, b), for twists u and their rates du (2, D + A, *batch)."""
-    rate = functools.partial(_change, so, of)
-    return jax.jvp(rate, (a, b, u), (*_tangents(so, a, b, u), du))[1]
-
-
-def by_twists(so: ModuleType, of: Callable, a: Pose, b: Pose) -> Array:
-    """Jacobian of a function of(a, b) -> (E, *batch) by the twists of a, then b, (E, 2 (D + A), *batch)."""
-    n, batch = so.D + so.A, a.x.shape[1:]
-    units = jnp.eye(2 * n, dtype=a.x.dtype).reshape(2 * n, 2, n, *[1] * len(batch))
-    units = units + jnp.zeros_like(a.x[:1])[None, None]
-    return jax.vmap(lambda unit: _change(so, of, a, b, unit), out_axes=1)(units)
-
-
-def _held(so: ModuleType, joint: Any) -> Callable:
-    return lambda a, b: joint(so, a, b)
-
-
-def _errors(so: ModuleType, groups: tuple[Placed, ...]) -> Array:
-    """(n, E, *batch) [m or rad]."""
-    return _of_each(lambda joint, a, b: joint(so, a, b), groups)
-
-
-def joint_rates(so: ModuleType, groups: tuple[Placed, ...], twists: Array) -> Array:
-    """J u for the twists u of the bodies of all joints, (n, 2, D + A, *batch) -> (n, E, *batch) [m/s or rad/s]."""
-    return _of_each(lambda joint, a, b, u: _change(so, _held(so, joint), a, b, u), groups, twists)
-
-
-def _accelerations(so: ModuleType, groups: tuple[Placed, ...], twists: Array, rates: Array) -> Array:
-    """J du + dJ/dt u for twists u that change at rates du, (n, E, *batch) [m/s^2 or rad/s^2]."""
-
-    def row(joint: Any, a: Pose, b: Pose, u: Array, du: Array) -> Array:
-        return _acceleration(so, _held(so, joint), a, b, u, du)
-
-    return _of_each(row, groups, twists, rates)
-
-
-def _jacobian(so: ModuleType, groups: tuple[Placed, ...]) -> Array:
-    """J by blocks, one for each of the two bodies of each joint, (n, E, 2, D + A, *batch)."""
-    flat = _of_each(lambda joint, a, b: by_twists(so, _held(so, joint), a, b), groups)
-    return flat.reshape(*flat.shape[:2], 2, so.D + so.A, *flat.shape[3:])
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _forces(so: ModuleType, sides: Array, groups: tuple[Placed, ...], lam: Array) -> Array:
-    """J^T lam on the two bodies of each joint, (n, 2, D + A, *batch), for multipliers (n, E, *batch).
-
-    Args:
-        sides: J as `_jacobian` has it. Not differentiated: the derivative of J^T lam is that of the transpose of J u,
-            which takes a fraction of the derivative of all columns of J.
-    """
-    del groups
-    return sum(sides[:, e] * lam[:, e, None, None] for e in range(lam.shape[1]))
-
-
-@_forces.defjvp
-def _forces_jvp(so, primals, tangents):
-    def transposed(groups, lam):
-        like = jax.eval_shape(functools.partial(_forces, so), *primals)
-        back = jax.linear_transpose(functools.partial(joint_rates, so, groups), like)
-        return back(lam)[0]
-
-    return _forces(so, *primals), jax.jvp(transposed, primals[1:], tangents[1:])[1]
 
 
 def islands(joints: tuple, moving: int) -> tuple[tuple[int, ...], ...]:
@@ -177,7 +71,7 @@ def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> 
     groups, live = placed(joints, statics, x, q), jnp.ravel(x)[0] < jnp.inf
     inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q)
     inverse_mass = 1.0 / bodies.mass
-    sides = apart(live, functools.partial(_jacobian, so), lax.stop_gradient(groups))
+    sides = apart(live, functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
     blocks = _blocks(so, ends, sides, *lax.stop_gradient((inverse_mass, inverse)))
     return Linkage(
         groups=groups, sides=sides, factors=factorise(plan(ends, len(x)), blocks), inverse_mass=inverse_mass,
@@ -188,10 +82,7 @@ def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> 
 def _blocks(so: ModuleType, ends: tuple[tuple[int, int], ...], sides: Array, mass: Array, inertia: Array) -> Array:
     """Of J M^-1 J^T, as `factorise` takes them: (n + pairs, E, E, *batch), from inverse masses and inertias."""
     moving, sides = len(mass), jnp.swapaxes(sides, 1, 2)
-    inertia, mass = (
-        rows_or_zeros(leaf, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
-        for leaf in (inertia, mass)
-    )
+    inertia, mass = (to_sides(ends, leaf) for leaf in (inertia, mass))
 
     def moved(inertia: Array, mass: Array, row: Array) -> Array:
         return jnp.concatenate([mass[None] * row[: so.D], so.apply(inertia, row[so.D :])])
@@ -206,7 +97,7 @@ def _blocks(so: ModuleType, ends: tuple[tuple[int, int], ...], sides: Array, mas
 
 @functools.cache
 def _shared(ends: tuple[tuple[int, int], ...], moving: int) -> tuple:
-    """For each pair of coupled joints the sides that are on one body, 2 i + s for side s of joint i; twice where both are."""
+    """Of each pair of coupled joints the sides on their common body, 2 i + s for side s of joint i; and on a second."""
     found = [
         [(2 * i + s, 2 * j + t) for s in (0, 1) for t in (0, 1) if ends[i][s] == ends[j][t] < moving]
         for i, j in plan(ends, moving).pairs
@@ -215,10 +106,10 @@ def _shared(ends: tuple[tuple[int, int], ...], moving: int) -> tuple:
     return tuple(tuple(zip(*((some + [(-1, -1)])[k] for some in found), strict=True)) for k in range(most))
 
 
-def to_sides(ends: tuple[tuple[int, int], ...], twists: Array) -> Array:
-    """Twists of bodies (N, D + A, *batch) at the two ends of every joint, (n, 2, D + A, *batch)."""
-    moving = len(twists)
-    return rows_or_zeros(twists, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
+def to_sides(ends: tuple[tuple[int, int], ...], values: Array) -> Array:
+    """What bodies have (N, ...) at the two ends of every joint, (n, 2, ...); zeros of what stands still."""
+    moving = len(values)
+    return rows_or_zeros(values, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
 
 
 def _by_body(ends: tuple[tuple[int, int], ...], moving: int, by_sides: Array) -> Array:
@@ -243,7 +134,7 @@ def _rates(link: Linkage, twists: Array) -> Array:
 def _pull(link: Linkage, lam: Array) -> Array:
     """J^T lam on all bodies, (N, D + A, *batch)."""
     so = rotations(link.groups[0].a.x.shape[1])
-    return _by_body(link.ends, len(link.inverse_mass), _forces(so, link.sides, link.groups, lam))
+    return _by_body(link.ends, len(link.inverse_mass), joint_forces(so, link.sides, link.groups, lam))
 
 
 def _moved(link: Linkage, forces: Array) -> Array:
@@ -275,19 +166,24 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench) -> Wrench:
     """The forces of a world with those added that keep its joints."""
-    state = apart(jnp.ravel(state.x)[0] < jnp.inf, lambda state: state, state)
+    state = apart(_live(state), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
     given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1))
     gyroscopic = jax.vmap(so.gyroscopic)(bodies.inertia, state.q, state.w)
-    free = _moved(link, given.at[:, so.D :].add(-gyroscopic) if so.D == 3 else given)
+    free = _moved(link, given - jnp.pad(gyroscopic, [(0, 0), (so.D, 0), *[(0, 0)] * (given.ndim - 2)]))
 
     def falling(groups: tuple[Placed, ...], twists: Array, free: Array) -> Array:
-        return _accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
+        return joint_accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
 
-    target = apart(jnp.ravel(free)[0] < jnp.inf, falling, link.groups, _twists(state), free)
+    target = apart(_live(state), falling, link.groups, _twists(state), free)
     forces = given + _pull(link, _multipliers(link, target))
     return Wrench(F=forces[:, : so.D], tau=forces[:, so.D :])
+
+
+def _live(state: State) -> Array:
+    """True, for `apart`."""
+    return jnp.ravel(state.x)[0] < jnp.inf
 
 
 def _twists(state: State) -> Array:
@@ -306,7 +202,7 @@ def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array) -> Array
     for group, at in zip(joints, link.groups, strict=True):
         if getattr(group, "damping", None) is not None:
             ends = ends_of((group,))
-            resistance = _of_each(resisting, (at,), to_sides(ends, twists))
+            resistance = of_each(resisting, (at,), to_sides(ends, twists))
             forces = forces + _by_body(ends, len(forces), resistance)
     return forces
 
@@ -316,9 +212,9 @@ def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> St
 
     Both by J at the poses as they come, so that the velocities are then on the joints up to the displacement.
     """
-    state = apart(jnp.ravel(state.x)[0] < jnp.inf, lambda state: state, state)
+    state = apart(_live(state), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
-    off = jnp.stack([_errors(so, link.groups), _rates(link, _twists(state))])
+    off = jnp.stack([joint_errors(so, link.groups), _rates(link, _twists(state))])
     moved, kicked = jax.vmap(lambda off: _moved(link, _pull(link, _multipliers(link, off))))(off)
     q = jax.vmap(so.turn_by)(moved[:, so.D :], state.q)
     return State(x=state.x + moved[:, : so.D], q=q, v=state.v + kicked[:, : so.D], w=state.w + kicked[:, so.D :])

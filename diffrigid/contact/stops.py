@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.constraints import by_twists
 from diffrigid.contact.resting import Strikes
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.joints import Pose
-from diffrigid.linkage import by_twists
 from diffrigid.numerics import FOUND, implicit_root, rows, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
