@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.constraints import joint_rates, placed
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
 from diffrigid.joints import JOINTS, Distance, Pose, separation
-from diffrigid.linkage import jacobian
+from diffrigid.linkage import ends_of, to_sides
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
 from diffrigid.shapes import traced
@@ -133,9 +134,10 @@ def warn_of_torn_joints(world: Any, state: Any) -> None:
     def speeds(world: Any, state: Any) -> Any:
         parts = []
         for group in world.joints:
-            jac = jacobian((group,), world.statics, world.bodies, state)
-            rates = (jac.rows * jnp.concatenate([state.v, state.w], axis=1).reshape(1, -1)).sum(1)
-            parts.append(jnp.sqrt((rates.reshape(len(group.a), -1) ** 2).sum(1)))
+            at = placed((group,), world.statics, state.x, state.q)
+            twists = jnp.concatenate([state.v, state.w], axis=1)
+            rates = joint_rates(rotations(world.dim), at, to_sides(ends_of((group,)), twists))
+            parts.append(jnp.sqrt((rates**2).sum(1)))
         return jnp.concatenate(parts)
 
     rates = known(speeds, jax.tree.map(jnp.asarray, world), jax.tree.map(jnp.asarray, state))

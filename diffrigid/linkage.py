@@ -6,114 +6,34 @@ With J the Jacobian of all errors by the twists (dx, dtheta) of the bodies and M
     J M^-1 J^T lam = -J v                    the impulses that bring velocities onto the joints
     J M^-1 J^T lam = -error                  the displacements that bring poses onto the joints
 
-J and the rate of J v are derivatives of the error function in forward mode. All of it is differentiable in both
-modes, by anchors, axes and lengths too, except where a rod has no length.
+All of it is differentiable in both modes, by anchors, axes and lengths too, except where a rod has no length.
 Source: Witkin, Physically Based Modeling: Constrained Dynamics, SIGGRAPH 1997 course notes, sections 2 to 4.
 """
 
-from collections.abc import Callable
+import functools
 from types import ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
+from diffrigid.constraints import (
+    Placed,
+    by_twists,
+    joint_accelerations,
+    joint_errors,
+    joint_forces,
+    joint_jacobian,
+    joint_rates,
+    of_each,
+    placed,
+)
+from diffrigid.elimination import Factor, factorise, plan, substitute
 from diffrigid.joints import Pose
-from diffrigid.numerics import constant, identity, rows, solve_symmetric
-from diffrigid.pytree import array, pytree, replace
+from diffrigid.numerics import apart, dot, rows_or_zeros
+from diffrigid.pytree import array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, rotations
-
-
-@pytree
-class Jacobian:
-    """J as rows R, with one column for each component of the twist (dx, dtheta) of each body, (D + A) N in all."""
-
-    rows: Array = array("R", "C")  # (R, C, *batch)
-    mobile: Array = array("R", "C")  # (R, C, *batch) J M^-1
-    error: Array = array("R")  # (R, *batch) [m or rad]
-    rate: Array = array("R")  # (R, *batch) dJ/dt v [m/s^2 or rad/s^2]
-
-
-def jacobian(joints: tuple, statics: Any, bodies: Bodies, state: State) -> Jacobian:
-    """Of all joints of a world, which are the rows of some records of many joints each."""
-    so, moving = rotations(bodies.dim), state.x.shape[0]
-    inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), state.q)
-
-    def row(joint: Any, a: Pose, b: Pose, v_a: Array, v_b: Array) -> tuple[Array, Array, Array]:
-        return differentiated(so, lambda a, b: joint(so, a, b), a, b, v_a, v_b)
-
-    parts = []
-    for group in joints:
-        error, rate, by_twists = _of_each(row, group, statics, state)
-        parts.append((error, rate, _by_bodies(group, by_twists, moving)))
-    error, rate, columns = (
-        jnp.concatenate([leaf.reshape(-1, *leaf.shape[2:]) for leaf in part]) for part in zip(*parts, strict=True)
-    )
-    mobile = jax.vmap(lambda row: _mobile(so, bodies, inverse, row))(columns)
-    return Jacobian(error=error, rate=rate, rows=columns, mobile=mobile)
-
-
-def _of_each(row: Callable, group: Any, statics: Any, state: State) -> Any:
-    """`row(joint, pose_a, pose_b, twist_a, twist_b)` of every joint of a group."""
-    twist = jnp.concatenate([state.v, state.w], axis=1)
-    padded = jnp.concatenate([twist, jnp.zeros((len(statics.x) + 1, *twist.shape[1:]), twist.dtype)])
-    poses = (_poses(statics, state, ends) for ends in (group.a, group.b))
-    twists = (rows(padded, ends) for ends in (group.a, group.b))
-    return jax.vmap(row)(replace(group, a=None, b=None), *poses, *twists)
-
-
-def _by_bodies(group: Any, by_twists: Array, moving: int) -> Array:
-    """Jacobians by the twists of a and b (M, E, 2 (D + A), ...), as ones by those of all bodies (M, E, C, ...)."""
-    count, size, both, *batch = by_twists.shape
-    columns, n = jnp.zeros((1, 1, 1, 1, *[1] * len(batch)), by_twists.dtype), both // 2
-    for side, ends in enumerate((group.a, group.b)):
-        where = constant(tuple(tuple(float(k == body) for k in range(moving)) for body in ends), str(by_twists.dtype))
-        where = where.reshape(count, 1, moving, 1, *[1] * len(batch))
-        columns = columns + where * by_twists[:, :, None, side * n : (side + 1) * n]
-    return columns.reshape(count, size, moving * n, *batch)
-
-
-def differentiated(
-    so: ModuleType, of: Callable, a: Pose, b: Pose, v_a: Array, v_b: Array
-) -> tuple[Array, Array, Array]:
-    """What a function of the poses of two bodies is, and how it changes with their motion.
-
-    Args:
-        of: (a, b) -> (E, *batch).
-        v_a, v_b: (D + A, *batch) twists of the bodies.
-
-    Returns:
-        its value (E, *batch); its acceleration (E, *batch) while the twists stay; and its Jacobian by the twists of
-        a, then b, (E, 2 (D + A), *batch).
-    """
-    n, batch = so.D + so.A, a.x.shape[1:]
-
-    def change(poses, v):  # for twists v (2, D + A) of the two bodies
-        tangent = tuple(Pose(u[: so.D], so.rate(u[so.D :], pose.q)) for u, pose in zip(v, poses, strict=True))
-        return jax.jvp(lambda poses: of(*poses), (poses,), (tangent,))[1]
-
-    v, poses = jnp.stack([v_a, v_b]), (a, b)
-    tangent = tuple(Pose(u[: so.D], so.rate(u[so.D :], pose.q)) for u, pose in zip(v, poses, strict=True))
-    second = jax.jvp(lambda poses: change(poses, v), (poses,), (tangent,))[1]
-    units = jnp.eye(2 * n, dtype=v.dtype).reshape(2 * n, 2, n, *[1] * len(batch)) + jnp.zeros_like(v)[None]
-    return of(a, b), second, jax.vmap(lambda unit: change(poses, unit), out_axes=1)(units)
-
-
-def _mobile(so: ModuleType, bodies: Bodies, inverse: Array, columns: Array) -> Array:
-    """M^-1 times forces and torques (C, *batch)."""
-    by_body = columns.reshape(bodies.mass.shape[0], so.D + so.A, *columns.shape[1:])
-    linear = by_body[:, : so.D] / bodies.mass[:, None]
-    return jnp.concatenate([linear, jax.vmap(so.apply)(inverse, by_body[:, so.D :])], axis=1).reshape(columns.shape)
-
-
-def _poses(statics: Any, state: State, ends: tuple[int, ...]) -> Pose:
-    """Of colliders: bodies, then statics, then the world, which stands at the origin."""
-    batch = state.x.shape[2:]
-    still = [jnp.broadcast_to(leaf, leaf.shape[:2] + batch) for leaf in (statics.x, statics.q)]
-    world = jnp.zeros_like(state.x[:1]), jnp.zeros_like(state.q[:1]).at[:, 0].set(1.0)
-    x, q = (jnp.concatenate(parts) for parts in zip((state.x, state.q), still, world, strict=True))
-    return Pose(rows(x, ends), rows(q, ends))
 
 
 def islands(joints: tuple, moving: int) -> tuple[tuple[int, ...], ...]:
@@ -128,93 +48,173 @@ def islands(joints: tuple, moving: int) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(sorted(bodies)) for bodies in together)
 
 
+def ends_of(joints: Any) -> tuple[tuple[int, int], ...]:
+    """Colliders a and b of every joint."""
+    return tuple(pair for group in joints for pair in zip(group.a, group.b, strict=True))
+
+
 @pytree
 class Linkage:
-    """How joints spread impulses: lam = -inverse (J twist) for a change of the twists of free bodies."""
+    """How the n joints of a world act on its N moving bodies."""
 
-    rows: Array = array("R", "C")  # (R, C, *batch) J
-    mobile: Array = array("R", "C")  # (R, C, *batch) J M^-1
-    inverse: Array = array("R", "R")  # (R, R, *batch) of J M^-1 J^T
+    groups: tuple[Placed, ...] = ()
+    sides: Array = array("n", "E", "2", "D + A")  # J, without derivative
+    factors: tuple[Factor, ...] = ()  # of J M^-1 J^T, without derivative
+    inverse_mass: Array = array("N")  # [1/kg]
+    inverse_inertia: Array = array("N")  # [1/(kg m^2)] world axes
+    ends: tuple[tuple[int, int], ...] = static()  # colliders a and b of every joint
 
 
-def linkage(joints: tuple, statics: Any, bodies: Bodies, state: State) -> Linkage:
-    """Of the joints of a world at these poses."""
-    jac = jacobian(joints, statics, bodies, state)
-    matrix = _mobility(jac)
-    inverse = jax.vmap(lambda unit: solve_symmetric(matrix, unit))(identity(matrix))
-    return Linkage(rows=jac.rows, mobile=jac.mobile, inverse=inverse)
+def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> Linkage:
+    """Of the joints of a world at these poses (N, D, *batch), (N, Q, *batch)."""
+    so, ends = rotations(bodies.dim), ends_of(joints)
+    groups, live = placed(joints, statics, x, q), jnp.ravel(x)[0] < jnp.inf
+    inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q)
+    inverse_mass = 1.0 / bodies.mass
+    sides = apart(live, functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
+    blocks = _blocks(so, ends, sides, *lax.stop_gradient((inverse_mass, inverse)))
+    return Linkage(
+        groups=groups, sides=sides, factors=factorise(plan(ends, len(x)), blocks), inverse_mass=inverse_mass,
+        inverse_inertia=inverse, ends=ends,
+    )  # fmt: skip
+
+
+def _blocks(so: ModuleType, ends: tuple[tuple[int, int], ...], sides: Array, mass: Array, inertia: Array) -> Array:
+    """Of J M^-1 J^T, as `factorise` takes them: (n + pairs, E, E, *batch), from inverse masses and inertias."""
+    moving, sides = len(mass), jnp.swapaxes(sides, 1, 2)
+    inertia, mass = (to_sides(ends, leaf) for leaf in (inertia, mass))
+
+    def moved(inertia: Array, mass: Array, row: Array) -> Array:
+        return jnp.concatenate([mass[None] * row[: so.D], so.apply(inertia, row[so.D :])])
+
+    mobile = jax.vmap(jax.vmap(jax.vmap(moved, (None, None, 0))))(inertia, mass, sides)
+    entry = jax.vmap(jax.vmap(jax.vmap(dot, (None, 0)), (0, None)))
+    own = entry(sides[:, 0], mobile[:, 0]) + entry(sides[:, 1], mobile[:, 1])
+    sides, mobile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (sides, mobile))
+    shared = [entry(rows_or_zeros(sides, i), rows_or_zeros(mobile, j)) for i, j in _shared(ends, moving)]
+    return jnp.concatenate([own, functools.reduce(jnp.add, shared)]) if shared else own
+
+
+@functools.cache
+def _shared(ends: tuple[tuple[int, int], ...], moving: int) -> tuple:
+    """Of each pair of coupled joints the sides on their common body, 2 i + s for side s of joint i; and on a second."""
+    found = [
+        [(2 * i + s, 2 * j + t) for s in (0, 1) for t in (0, 1) if ends[i][s] == ends[j][t] < moving]
+        for i, j in plan(ends, moving).pairs
+    ]
+    most = max(map(len, found), default=0)
+    return tuple(tuple(zip(*((some + [(-1, -1)])[k] for some in found), strict=True)) for k in range(most))
+
+
+def to_sides(ends: tuple[tuple[int, int], ...], values: Array) -> Array:
+    """What bodies have (N, ...) at the two ends of every joint, (n, 2, ...); zeros of what stands still."""
+    moving = len(values)
+    return rows_or_zeros(values, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
+
+
+def _by_body(ends: tuple[tuple[int, int], ...], moving: int, by_sides: Array) -> Array:
+    """What both bodies of every joint get (n, 2, ...), summed over the joints of every moving body, (N, ...)."""
+    return rows_or_zeros(by_sides.reshape(-1, *by_sides.shape[2:]), _sides_of(ends, moving)).sum(1)
+
+
+@functools.cache
+def _sides_of(ends: tuple[tuple[int, int], ...], moving: int) -> tuple[tuple[int, ...], ...]:
+    """For every moving body the sides of joints that are on it, padded by -1."""
+    sides = [[2 * i + s for i, pair in enumerate(ends) for s in (0, 1) if pair[s] == body] for body in range(moving)]
+    most = max(map(len, sides))
+    return tuple(tuple(own + [-1] * (most - len(own))) for own in sides)
+
+
+def _rates(link: Linkage, twists: Array) -> Array:
+    """J u for the twists u of all bodies (N, D + A, *batch), (n, E, *batch)."""
+    so = rotations(link.groups[0].a.x.shape[1])
+    return joint_rates(so, link.groups, to_sides(link.ends, twists))
+
+
+def _pull(link: Linkage, lam: Array) -> Array:
+    """J^T lam on all bodies, (N, D + A, *batch)."""
+    so = rotations(link.groups[0].a.x.shape[1])
+    return _by_body(link.ends, len(link.inverse_mass), joint_forces(so, link.sides, link.groups, lam))
+
+
+def _moved(link: Linkage, forces: Array) -> Array:
+    """M^-1 times forces and torques (N, D + A, *batch)."""
+    so = rotations(link.groups[0].a.x.shape[1])
+    turn = jax.vmap(so.apply)(link.inverse_inertia, forces[:, so.D :])
+    return jnp.concatenate([link.inverse_mass[:, None] * forces[:, : so.D], turn], axis=1)
+
+
+def _multipliers(link: Linkage, target: Array) -> Array:
+    """lam of J M^-1 J^T lam = -target, for targets (n, E, *batch)."""
+
+    def product(lam: Array) -> Array:
+        return _rates(link, _moved(link, _pull(link, lam)))
+
+    def solve(_, right: Array) -> Array:
+        return substitute(plan(link.ends, len(link.inverse_mass)), link.factors, right)
+
+    return lax.custom_linear_solve(product, -target, solve, symmetric=True)
 
 
 def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
     """Changes of v, w and L that the joints add to changes dv (N, D, *batch), dw (N, A, *batch) of free bodies."""
-    (moving, D), A = dv.shape[:2], dw.shape[1]
-    twist = jnp.concatenate([dv, dw], axis=1).reshape(moving * (D + A), *dv.shape[2:])
-    lam = -(link.inverse * (link.rows * twist[None]).sum(1)[None]).sum(1)
-    moved, forced = (
-        (side * lam[:, None]).sum(0).reshape(moving, D + A, *lam.shape[1:]) for side in (link.mobile, link.rows)
-    )
+    D = dv.shape[1]
+    forced = _pull(link, _multipliers(link, _rates(link, jnp.concatenate([dv, dw], axis=1))))
+    moved = _moved(link, forced)
     return moved[:, :D], moved[:, D:], forced[:, D:]
-
-
-def _mobility(jac: Jacobian) -> Array:
-    """J M^-1 J^T, (R, R, *batch)."""
-    return (jac.rows[:, None] * jac.mobile[None]).sum(2)
-
-
-def _multipliers(jac: Jacobian, target: Array) -> Array:
-    """lam of J M^-1 J^T lam = -target, (R, *batch)."""
-    return -solve_symmetric(_mobility(jac), target)
-
-
-def _columns(jac: Jacobian, lam: Array) -> Array:
-    """J M^-1 applied: the twists of all bodies for multipliers lam, (C, *batch)."""
-    return (jac.mobile * lam[:, None]).sum(0)
 
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench) -> Wrench:
     """The forces of a world with those added that keep its joints."""
-    so, moving = rotations(bodies.dim), state.x.shape[0]
-    jac = jacobian(joints, statics, bodies, state)
-    inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), state.q)
-    damped = _damping(joints, statics, state)
-    tau = damped[:, so.D :] + (0.0 if wrench.tau is None else wrench.tau)
-    wrench = Wrench(F=wrench.F + damped[:, : so.D], tau=tau)
+    state = apart(_live(state), lambda state: state, state)  # else computed again for every use of it
+    so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
+    torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
+    given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1))
     gyroscopic = jax.vmap(so.gyroscopic)(bodies.inertia, state.q, state.w)
-    free = jnp.concatenate([wrench.F, tau - gyroscopic], axis=1).reshape(-1, *state.x.shape[2:])
-    free = _mobile(so, bodies, inverse, free)
-    lam = _multipliers(jac, (jac.rows * free[None]).sum(1) + jac.rate)
-    forces = (jac.rows * lam[:, None]).sum(0).reshape(moving, so.D + so.A, *state.x.shape[2:])
-    return Wrench(F=wrench.F + forces[:, : so.D], tau=tau + forces[:, so.D :])
+    free = _moved(link, given - jnp.pad(gyroscopic, [(0, 0), (so.D, 0), *[(0, 0)] * (given.ndim - 2)]))
+
+    def falling(groups: tuple[Placed, ...], twists: Array, free: Array) -> Array:
+        return joint_accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
+
+    target = apart(_live(state), falling, link.groups, _twists(state), free)
+    forces = given + _pull(link, _multipliers(link, target))
+    return Wrench(F=forces[:, : so.D], tau=forces[:, so.D :])
 
 
-def _damping(joints: tuple, statics: Any, state: State) -> Array:
-    """Forces and torques of the damping of joints, (N, D + A, *batch)."""
-    moving, so = state.x.shape[0], rotations(state.x.shape[1])
-    total = jnp.zeros((moving, so.D + so.A, *state.x.shape[2:]), state.x.dtype)
+def _live(state: State) -> Array:
+    """True, for `apart`."""
+    return jnp.ravel(state.x)[0] < jnp.inf
 
-    def resisting(joint: Any, a: Pose, b: Pose, v_a: Array, v_b: Array) -> Array:
-        along = differentiated(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b, v_a, v_b)[2][0]
-        return (-joint.damping * (along * jnp.concatenate([v_a, v_b])).sum(0) * along)[None]
 
-    for group in joints:
+def _twists(state: State) -> Array:
+    """(N, D + A, *batch)."""
+    return jnp.concatenate([state.v, state.w], axis=1)
+
+
+def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array) -> Array:
+    """Forces and torques on all bodies (N, D + A, *batch) with those added of the damping of joints."""
+    so = rotations(link.groups[0].a.x.shape[1])
+
+    def resisting(joint: Any, a: Pose, b: Pose, u: Array) -> Array:
+        along = by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0].reshape(u.shape)
+        return -joint.damping * (along * u).sum((0, 1)) * along
+
+    for group, at in zip(joints, link.groups, strict=True):
         if getattr(group, "damping", None) is not None:
-            forces = _by_bodies(group, _of_each(resisting, group, statics, state), moving)
-            total = total + forces.sum((0, 1)).reshape(total.shape)
-    return total
+            ends = ends_of((group,))
+            resistance = of_each(resisting, (at,), to_sides(ends, twists))
+            forces = forces + _by_body(ends, len(forces), resistance)
+    return forces
 
 
 def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> State:
-    """The state with poses, then velocities, brought onto the joints, by what joints can do: J^T lam, and no more."""
-    so, moving = rotations(bodies.dim), state.x.shape[0]
+    """The state with poses and velocities brought onto the joints, by what joints can do: J^T lam, and no more.
 
-    def split(columns):
-        by_body = columns.reshape(moving, so.D + so.A, *columns.shape[1:])
-        return by_body[:, : so.D], by_body[:, so.D :]
-
-    jac = jacobian(joints, statics, bodies, state)
-    dx, turn = split(_columns(jac, _multipliers(jac, jac.error)))
-    state = replace(state, x=state.x + dx, q=jax.vmap(so.turn_by)(turn, state.q))
-    jac = jacobian(joints, statics, bodies, state)
-    twist = jnp.concatenate([state.v, state.w], axis=1).reshape(-1, *state.x.shape[2:])
-    dv, dw = split(_columns(jac, _multipliers(jac, (jac.rows * twist[None]).sum(1))))
-    return replace(state, v=state.v + dv, w=state.w + dw)
+    Both by J at the poses as they come, so that the velocities are then on the joints up to the displacement.
+    """
+    state = apart(_live(state), lambda state: state, state)  # else computed again for every use of it
+    so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
+    off = jnp.stack([joint_errors(so, link.groups), _rates(link, _twists(state))])
+    moved, kicked = jax.vmap(lambda off: _moved(link, _pull(link, _multipliers(link, off))))(off)
+    q = jax.vmap(so.turn_by)(moved[:, so.D :], state.q)
+    return State(x=state.x + moved[:, : so.D], q=q, v=state.v + kicked[:, : so.D], w=state.w + kicked[:, so.D :])

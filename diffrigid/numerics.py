@@ -99,6 +99,17 @@ def fold(op: Any, table: Array, axis: int) -> Array:
     return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
 
 
+def rows_or_zeros(values: Array, index: tuple) -> Array:
+    """`rows`, where the index -1 stands for zeros."""
+    table = np.array(index)
+    if (table >= 0).all():
+        return rows(values, index)
+    some = np.maximum(table, 0).tolist()
+    chosen = rows(values, tuple(some if table.ndim == 1 else map(tuple, some)))
+    there = (constant(index, "int32") >= 0).reshape(*table.shape, *[1] * (chosen.ndim - table.ndim))
+    return jnp.where(there, chosen, 0.0)
+
+
 def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]], Any]]:
     """The leaves (M, ..., *batch) of a tree side by side, as one array (M, F, *batch) for each shape of the batch.
 
@@ -221,25 +232,6 @@ def normalise(a: Array, fallback: Array | None = None) -> Array:
     return jnp.where(nonzero[None], unit, jnp.zeros_like(a) if fallback is None else fallback)
 
 
-def solve_symmetric(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, for symmetric positive semidefinite matrices (R, R, *batch), (R, *batch) -> (R, *batch).
-
-    A direction in which the matrix is zero to rounding, as of a constraint that repeats others, is left out: x is
-    then one of many solutions, and finite. Gauss-Jordan in one loop, so that the batch stays the last axis; the
-    derivative is another solution.
-    """
-
-    def solve(matvec, right):
-        del matvec
-        rounding = 1e2 * jnp.finfo(matrix.dtype).eps * matrix.shape[0] * jnp.abs(matrix).max((0, 1))
-        return _gauss_jordan(matrix, right[:, None], rounding)[:, 0]
-
-    def product(x):
-        return (matrix * x[None]).sum(1)
-
-    return lax.custom_linear_solve(product, right, solve, symmetric=True)
-
-
 def solve_regular(matrix: Array, right: Array) -> Array:
     """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), without derivative.
 
@@ -251,7 +243,7 @@ def solve_regular(matrix: Array, right: Array) -> Array:
         turned = jnp.swapaxes(q, -2, -1) @ jnp.moveaxis(right, (0, 1), (-2, -1))
         return jnp.moveaxis(lax.linalg.triangular_solve(r, turned, left_side=True), (-2, -1), (0, 1))
     if len(matrix) > SMALL:
-        return _gauss_jordan(matrix, right, jnp.zeros_like(matrix[0, 0]))
+        return _gauss_jordan(matrix, right)
 
     def eliminate(k, system):
         column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
@@ -269,13 +261,13 @@ def identity(like: Array) -> Array:
     return jnp.eye(size, dtype=like.dtype).reshape(size, size, *[1] * len(batch)) + jnp.zeros_like(like)
 
 
-def _gauss_jordan(matrix: Array, right: Array, rounding: Array) -> Array:
+def _gauss_jordan(matrix: Array, right: Array) -> Array:
     """x of matrix x = right, (R, R, *batch), (R, M, *batch) -> (R, M, *batch).
 
-    Pivots are chosen by column in each matrix of the batch; rows stay where they are. A direction whose pivot is no
-    more than `rounding` (*batch) is left out.
+    Pivots are chosen by column in each matrix of the batch; rows stay where they are. A direction whose pivot is 0 is
+    left out.
     """
-    matrix, count = lax.stop_gradient(matrix), matrix.shape[0]
+    count = matrix.shape[0]
     index = lax.broadcasted_iota(np.int32, (count, *matrix.shape[2:]), 0)
 
     def eliminate(k, carry):
@@ -285,8 +277,7 @@ def _gauss_jordan(matrix: Array, right: Array, rounding: Array) -> Array:
         chosen = index == best.astype(np.int32)[None]
         row = jnp.where(chosen[:, None], system, 0.0).sum(0)
         pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
-        usable = jnp.abs(pivot) > rounding
-        row = row * jnp.where(usable, 1.0 / jnp.where(usable, pivot, 1.0), 0.0)[None]
+        row = row * safe_divide(jnp.ones_like(pivot), pivot)[None]
         system = jnp.where(chosen[:, None], row[None], system - column[:, None] * row[None])
         return system, jnp.where(chosen, k, order)
 

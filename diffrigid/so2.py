@@ -4,10 +4,12 @@ Orientation q = (cos, sin), (2, *batch); angular velocity and momentum have one 
 inertia is a number, (*batch). Vectors (2, *batch). World and body rotation rates are the same in the plane.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import cos_sin, dot
+from diffrigid.numerics import components, cos_sin, dot
 
 D, A, Q = 2, 1, 2  # components of a vector, of an angular velocity, of an orientation
 
@@ -30,24 +32,31 @@ def unrotate(q: Array, r: Array) -> Array:
 
 def compose(q: Array, p: Array) -> Array:
     """First p, then q; brought back to unit length, so that rounding does not accumulate."""
-    product = rotate(q, p)  # of complex numbers
-    # One Newton step for 1 / |product| about 1: exact to rounding for products of unit vectors.
-    return product * (1.5 - 0.5 * dot(product, product))[None]
+    return _unit_product(q, p)
 
 
 def exp(phi: Array) -> Array:
     """Orientation of the rotation by phi [rad], (1, *batch)."""
-    return jnp.concatenate(cos_sin(phi))
+    return components(*cos_sin(phi[0]))
 
 
 def turn_by(phi: Array, q: Array) -> Array:
     """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
-    return compose(exp(phi), q)
+    return _unit_product(q, cos_sin(phi[0]))
 
 
 def turn_in_body(q: Array, phi: Array) -> Array:
     """q turned further by the rotation vector phi in body axes: the same in the plane."""
-    return compose(q, exp(phi))
+    return _unit_product(q, cos_sin(phi[0]))
+
+
+def _unit_product(q: Any, p: Any) -> Array:
+    """Product of complex numbers. XLA would compute a vector again for each component that is picked from it."""
+    (a, b), (c, s) = q, p
+    x, y = a * c - b * s, a * s + b * c
+    # One Newton step for 1 / |product| about 1: exact to rounding for products of unit vectors.
+    scale = 1.5 - 0.5 * (x * x + y * y)
+    return components(scale * x, scale * y)
 
 
 def log(q: Array) -> Array:

@@ -27,6 +27,7 @@ COLLIDERS: dict[tuple[type, type], Callable[..., Contacts]] = {
 COLLIDERS |= {(a, HalfSpace): convex_halfspace for a in CONVEX_2D + CONVEX_3D}
 COLLIDERS |= {(a, Profile): convex_profile for a in CONVEX_2D}
 COLLIDERS |= {(Disc, Disc): round_round, (Sphere, Sphere): round_round}
-COLLIDERS |= {(Disc, HalfSpace): round_halfspace, (Sphere, HalfSpace): round_halfspace, (Box, HalfSpace): box_halfspace}
+COLLIDERS |= {(Disc, HalfSpace): round_halfspace, (Sphere, HalfSpace): round_halfspace}
+COLLIDERS[Box, HalfSpace] = box_halfspace
 
 __all__ = ["COLLIDERS", "Contacts", "PairGroup", "pair_groups"]

@@ -252,9 +252,7 @@ def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility]:
     q, so = jax.vmap(orientation)(flight, t), rotations(flight.dim)
     inverse, link = jax.vmap(so.world_inverse)(flight.inverse_inertia, q), None
     if world.joints:
-        still = jnp.zeros_like(flight.v)
-        state = State(x=jax.vmap(position)(flight, t), q=q, v=still, w=jnp.zeros_like(flight.L))
-        link = linkage(world.joints, world.statics, world.bodies, state)
+        link = linkage(world.joints, world.statics, world.bodies, jax.vmap(position)(flight, t), q)
     return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse, link=link)
 
 

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.constraints import by_twists
 from diffrigid.contact.resting import Strikes
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.joints import Pose
-from diffrigid.linkage import differentiated
 from diffrigid.numerics import FOUND, implicit_root, rows, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
@@ -90,7 +90,7 @@ def _row(kind: str, dt: Array, at_end: Array, joint: Any, a: Flight, b: Flight, 
     inverses = [so.world_inverse(f.inverse_inertia, pose.q) for f, pose in zip((a, b), poses, strict=True)]
     spins = [so.apply(i, angular_momentum(f, s)) for i, f in zip(inverses, (a, b), strict=True)]
     twists = [jnp.concatenate([velocity(f, s), w]) for f, w in zip((a, b), spins, strict=True)]
-    along = sign * differentiated(so, lambda a, b: joint.coordinate(so, a, b)[None], *poses, *twists)[2][0]
+    along = sign * by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], *poses)[0]
     jac = along.reshape(2, so.D + so.A, *dt.shape)
     rate = (jac * jnp.stack(twists)).sum((0, 1))
     bend = lax.stop_gradient(_second(gap, s))
