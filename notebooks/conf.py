@@ -61,7 +61,7 @@ def plain(app, what, name, obj, options, lines):
 
 
 def marked(lines):
-    """Lines in which indented blocks are formulas or code, unless a section is; the rest is text."""
+    """Lines: indented blocks are formulas or code, unless a section is; the rest is text."""
     section = example = block = False
     for before, line in zip(["", *lines], lines):
         indented = line.startswith("  ")
