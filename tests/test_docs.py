@@ -10,10 +10,9 @@ import pytest
 
 import diffrigid as dr
 
-pytest.importorskip("myst_nb", reason='the site is built by the extra: pip install -e ".[docs]"')
-pytest.importorskip("furo", reason='the site is built by the extra: pip install -e ".[docs]"')
-
 ROOT = Path(__file__).parent.parent
+COMING_FROM = (ROOT / "notebooks" / "coming_from.md").read_text()
+SECTIONS = re.split(r"\n## ", COMING_FROM)
 ATTRIBUTES = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src", "object": "data"}
 
 
@@ -33,6 +32,8 @@ class Loads(HTMLParser):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """The folder with the pages. Every warning is an error: links to functions that are not there, too."""
+    for name in ("myst_nb", "furo"):
+        pytest.importorskip(name, reason='the site is built by the extra: pip install -e ".[docs]"')
     out = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", out / "trees", ROOT / "notebooks", out]
     built = subprocess.run(command, capture_output=True, text=True)
@@ -64,3 +65,17 @@ def test_formulas_are_drawn_and_nothing_was_executed(site):
     page = (site / "equations.html").read_text()
     assert page.count("<math") > 50 and "$" not in re.sub(r"<(script|style).*?</\1>", "", page, flags=re.S)
     assert not [*site.rglob("reports")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.splitlines()[0])
+def test_the_same_scene_elsewhere_gives_what_the_page_says(section):
+    """Where the simulator is installed; in a process of its own, with its own settings."""
+    code = "".join(re.findall(r"```python\n(.*?)```", section, flags=re.S))
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    if missing := re.search(r"^(?:ModuleNotFound|Import)Error: (.*)", run.stderr, flags=re.M):
+        pytest.skip(f"its simulator is not installed: {missing[1]}")
+    assert run.returncode == 0, run.stderr
+    said = re.findall(r"# ([\d.]+) m$", code, flags=re.M)
+    printed = re.findall(r"^[\d.]+$", run.stdout, flags=re.M)
+    assert said and [f"{float(height):.4f}" for height in printed] == said
