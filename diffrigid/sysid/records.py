@@ -27,6 +27,11 @@ class Record:
         state: its own initial state; default that of `fit`. world: likewise.
         start: [s] time of the initial state; default the first time of its columns.
         noise: standard deviations of its columns, numbers or arrays like the columns; default those of `fit`.
+
+    Example:
+        >>> drops = [dr.Record(measured), dr.Record(measured, state=state, noise={"ball.x": 1e-3})]
+        >>> drops[0].state is None  # then that of the fit
+        True
     """
 
     observations: Any
