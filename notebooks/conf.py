@@ -25,6 +25,7 @@ html_theme = "furo"
 html_title = "diffrigid"
 html_show_copyright = html_show_sphinx = html_copy_source = False
 html_math_renderer = "mathml"
+smartquotes = False
 nitpicky = True  # a link to a function that is not there is a warning, and with -W an error
 
 nb_execution_mode = "off"

@@ -1,0 +1,327 @@
+"""Are the gradients of other differentiable simulators right where bodies strike each other?"""
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+STARTS, SEED, NEAR = 5, 0, 1e-3  # starts, and by how much of themselves their numbers differ
+RADIUS = {"one bounce": 0.1, "two discs": 0.4, "three discs": 0.4}  # [m]
+DISCS = ((0.0, 0.0), (1.5, 0.1), (3.2, 0.35))  # [m] where they start
+CASES = {  # theta: (restitution, y, v_y, g) of a ball above a floor; (restitution, mass of b, v of a) of discs
+    "one bounce": ((0.8, 1.0, 0.5, 9.81), 0.6),
+    "two discs": ((0.8, 2.0, 2.0, 0.1), 1.2),
+    "three discs": ((0.8, 2.0, 2.0, 0.1), 2.0),
+}
+ENGINES = {  # function, its options, steps per second
+    "diffrigid": ("diffrigid", {}, 60),
+    "diffrigid float32": ("diffrigid", {"x64": False}, 60),
+    "Brax spring": ("brax", {"pipeline": "spring"}, 240),
+    "Brax positional": ("brax", {"pipeline": "positional"}, 240),
+    "Brax positional 1/2400": ("brax", {"pipeline": "positional"}, 2400),
+    "Brax generalized": ("brax", {"pipeline": "generalized"}, 240),
+    "MJX spring 1e4": ("mjx", {"stiffness": 1e4}, 960),
+    "MJX spring 1e6": ("mjx", {"stiffness": 1e6}, 2400),
+    "Jax2D": ("jax2d", {"x64": False}, 240),
+    "Newton XPBD": ("newton", {"x64": False}, 240),
+}
+
+
+def start(name, theta):
+    """Positions and velocities (N, 2), masses (N,), restitution, gravity: what a simulation starts from."""
+    import jax.numpy as jnp
+
+    if name == "one bounce":
+        e, y, v, g = theta
+        return jnp.stack([0.0 * y, y])[None], jnp.stack([0.0 * v, v])[None], jnp.ones(1), e, g
+    e, mass, *v = theta
+    count = 2 if name == "two discs" else 3
+    x = jnp.asarray(DISCS[:count], jnp.result_type(float))
+    moving = jnp.zeros((count, 2)).at[0].set(jnp.stack(v))
+    return x, moving, jnp.ones(count).at[1].set(mass), e, 0.0 * e
+
+
+def exact(name, theta):
+    """Where the bodies are in the end, (N, 2) [m]; impacts, whose order is known, at their true times."""
+    import jax.numpy as jnp
+
+    (x, v, m, e, g), (_, T) = start(name, theta), CASES[name]
+    if name == "one bounce":
+        height, up = x[0, 1] - RADIUS[name], v[0, 1]
+        speed = jnp.sqrt(up**2 + 2.0 * g * height)
+        since = T - (up + speed) / g
+        return jnp.stack([0.0 * e, RADIUS[name] + e * speed * since - g * since**2 / 2])[None]
+    for a, b in ((0, 1), (1, 2))[: len(m) - 1]:  # x + v t are the lines on which the bodies are
+        P, W = x[a] - x[b], v[a] - v[b]
+        A, B, C = W @ W, P @ W, P @ P - 4.0 * RADIUS[name] ** 2
+        s = (-B - jnp.sqrt(B * B - A * C)) / A
+        n = (P + W * s) / (2.0 * RADIUS[name])
+        impulse = -(1.0 + e) * (n @ W) / (1.0 / m[a] + 1.0 / m[b]) * n
+        v = v.at[a].add(impulse / m[a]).at[b].add(-impulse / m[b])
+        x = x.at[a].add(-s * impulse / m[a]).at[b].add(s * impulse / m[b])
+    return x + v * T
+
+
+# ---- the engines: each a function of (case, steps per second, options) that returns theta -> (N, 2) [m]
+
+
+def diffrigid(name, rate):
+    import diffrigid as dr
+
+    steps = round(CASES[name][1] * rate)
+
+    def end(theta):
+        x, v, m, e, g = start(name, theta)
+        disc = dr.Disc(radius=RADIUS[name])
+        bodies = {str(k): dr.Body(disc, mass=m[k], x=x[k], v=v[k]) for k in range(len(m))}
+        down = {}
+        if name == "one bounce":
+            bodies["floor"] = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+            down = {"gravity": [0.0 * g, -g]}
+        world, state = dr.scene(bodies, restitution=e, **down)
+        return dr.rollout(world, state, dt=CASES[name][1] / steps, steps=steps).state.x[-1]
+
+    return end
+
+
+def in_space(plane):
+    """(N, 2) to (N, 3): y goes up."""
+    import jax.numpy as jnp
+
+    return jnp.stack([plane[:, 0], 0.0 * plane[:, 0], plane[:, 1]], axis=1)
+
+
+def mjcf(name, rate, geom="", custom="", option=""):
+    """The spheres, free, without friction."""
+    count = len(DISCS[: {"one bounce": 1, "two discs": 2, "three discs": 3}[name]])
+    sphere = f'<geom type="sphere" size="{RADIUS[name]}" mass="1"/>'
+    bodies = "".join(f'<body pos="{3 * k} 0 9"><freejoint/>{sphere}</body>' for k in range(count))
+    floor = '<geom type="plane" size="9 9 1"/>' if name == "one bounce" else ""
+    steps = round(CASES[name][1] * rate)
+    return (
+        f'<mujoco><option timestep="{CASES[name][1] / steps:.12g}" {option}/><custom>{custom}</custom>'
+        f'<default><geom condim="1" {geom}/></default><worldbody>{floor}{bodies}</worldbody></mujoco>'
+    ), steps
+
+
+def poses(name, theta):
+    """q and qd of free joints."""
+    import jax.numpy as jnp
+
+    x, v, *_ = start(name, theta)
+    unturned = jnp.zeros((len(x), 4)).at[:, 0].set(1.0)
+    q = jnp.concatenate([in_space(x), unturned], axis=1).ravel()
+    return q, jnp.concatenate([in_space(v), jnp.zeros((len(x), 3))], axis=1).ravel()
+
+
+def brax(name, rate, pipeline):
+    """Drags and Baumgarte's term, which would change the motion, are off."""
+    import importlib
+
+    import jax
+    import jax.numpy as jnp
+    from brax.io import mjcf as reader
+
+    pipeline = importlib.import_module(f"brax.{pipeline}.pipeline")
+    off = "".join(f'<numeric name="{n}" data="0"/>' for n in ("vel_damping", "ang_damping", "baumgarte_erp"))
+    text, steps = mjcf(name, rate, custom=off)
+    system = reader.loads(text)
+
+    def end(theta):
+        _, _, m, e, g = start(name, theta)
+        inertia = system.link.inertia.replace(mass=m, i=system.link.inertia.i * m[:, None, None])
+        here = system.replace(
+            elasticity=e + jnp.zeros(system.ngeom), link=system.link.replace(inertia=inertia),
+            gravity=jnp.stack([0.0 * g, 0.0 * g, -g]),
+        )  # fmt: skip
+        state = pipeline.init(here, *poses(name, theta))
+        act = jnp.zeros(0)
+        state = jax.lax.scan(lambda s, _: (pipeline.step(here, s, act), None), state, None, length=steps)[0]
+        return state.x.pos[:, ::2]
+
+    return end
+
+
+def damping_of(e, stiffness):
+    """Damping of a spring that rebounds with e, where it can push and not pull. Source: Schwager and Poeschel 2007."""
+    low, high = 0.0, 0.999
+    for _ in range(60):
+        u = 0.5 * (low + high)
+        w = math.sqrt(1 - u * u)
+        rebound = math.exp(-u / w * (math.pi - math.atan2(2 * u * w, 1 - 2 * u * u)))
+        low, high = (u, high) if rebound > e else (low, u)
+    return 2 * u * math.sqrt(stiffness)
+
+
+def mjx(name, rate, stiffness):
+    """MuJoCo has no restitution: a spring and the damper that rebounds alike, to first order in e.
+
+    With more than one iteration its solver is a loop, and there is no reverse mode.
+    """
+    import jax
+    import jax.numpy as jnp
+    import mujoco
+    from mujoco import mjx
+
+    text, steps = mjcf(name, rate, geom='solimp="0.99 0.99 0.001"', option='iterations="1" ls_iterations="4"')
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(text))
+    about = CASES[name][0][0]
+    damping = damping_of(about, stiffness)
+    slope = (damping_of(about + 1e-4, stiffness) - damping_of(about - 1e-4, stiffness)) / 2e-4
+
+    def end(theta):
+        _, _, m, e, g = start(name, theta)
+        solref = jnp.stack([-stiffness + 0.0 * e, -damping - slope * (e - about)])
+        mass = jnp.concatenate([jnp.zeros(1), m])
+        here = model.tree_replace({
+            "geom_solref": jnp.broadcast_to(solref, model.geom_solref.shape),
+            "body_mass": mass,
+            "body_inertia": model.body_inertia * mass[:, None],
+            "body_invweight0": model.body_invweight0 / jnp.maximum(mass, 1e-9)[:, None],
+            "opt.gravity": jnp.stack([0.0 * g, 0.0 * g, -g]),
+        })  # fmt: skip
+        q, qd = poses(name, theta)
+        data = mjx.make_data(here).replace(qpos=q, qvel=qd)
+        data = jax.lax.scan(lambda d, _: (mjx.step(here, d), None), data, None, length=steps)[0]
+        return data.qpos.reshape(-1, 7)[:, :3:2]
+
+    return end
+
+
+def jax2d(name, rate):
+    import jax
+    import jax.numpy as jnp
+    from jax2d.engine import PhysicsEngine, create_empty_sim
+    from jax2d.scene import add_circle_to_scene, add_rectangle_to_scene
+    from jax2d.sim_state import SimParams, StaticSimParams
+
+    count = {"one bounce": 1, "two discs": 2, "three discs": 3}[name]
+    static = StaticSimParams(
+        num_polygons=2, num_static_fixated_polys=1, num_circles=max(count, 2), num_joints=1, num_thrusters=1
+    )
+    steps, engine = round(CASES[name][1] * rate), PhysicsEngine(static)
+    empty = create_empty_sim(static, add_floor=False, add_walls_and_ceiling=False)
+    if name == "one bounce":
+        at, size = jnp.array([0.0, -0.5]), jnp.array([20.0, 1.0])
+        empty, _ = add_rectangle_to_scene(empty, static, at, size, fixated=True, friction=0.0, restitution=1.0)
+    for k in range(count):
+        at = jnp.array([3.0 * k, 5.0])
+        empty, _ = add_circle_to_scene(empty, static, at, RADIUS[name], friction=0.0, restitution=1.0)
+    params = SimParams(dt=CASES[name][1] / steps)
+    act = jnp.zeros(static.num_joints + static.num_thrusters)
+
+    def end(theta):
+        x, v, m, e, g = start(name, theta)
+        c = empty.circle
+        c = c.replace(
+            position=c.position.at[:count].set(x + 5.0 * (name != "one bounce")),  # off the idle polygon
+            velocity=c.velocity.at[:count].set(v), inverse_mass=c.inverse_mass.at[:count].set(1.0 / m),
+            restitution=c.restitution.at[:count].set(e),
+        )  # fmt: skip
+        sim = empty.replace(circle=c, gravity=jnp.stack([0.0 * g, -g]))
+        sim = jax.lax.scan(lambda s, _: (engine.step(s, params, act)[0], None), sim, None, length=steps)[0]
+        return sim.circle.position[:count] - 5.0 * (name != "one bounce")
+
+    return end
+
+
+# ---- measuring
+
+
+def thetas(name):
+    """(STARTS, 4) the same for every engine."""
+    spread = np.random.default_rng(SEED).uniform(-NEAR, NEAR, (STARTS, 4))
+    return np.array(CASES[name][0]) * (1.0 + spread)
+
+
+def of_jax(end, name):
+    """Ends, Jacobians by forward mode, what reverse mode gives, and CPU-seconds to compile both."""
+    import jax
+    import jax.numpy as jnp
+
+    starts = jnp.asarray(thetas(name), jnp.result_type(float))
+    began = time.process_time()
+    forward = jax.jit(jax.jacfwd(lambda t: 2 * (end(t),), has_aux=True)).lower(starts[0]).compile()
+    seconds = [time.process_time() - began]
+    jac, x = (np.asarray(part, float) for part in zip(*map(forward, starts), strict=True))
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=x.shape[1:]), starts.dtype)
+    began = time.process_time()
+    try:
+        reverse = jax.jit(jax.grad(lambda t: (weights * end(t)).sum())).lower(starts[0]).compile()
+        back = np.asarray(reverse(starts[0]), float).tolist()
+    except (ValueError, TypeError, NotImplementedError) as error:
+        back = str(error).splitlines()[0]
+    seconds.append(time.process_time() - began)
+    return x, jac, back, seconds
+
+
+def measure(engine, name):
+    """In a process of its own: what `table` prints."""
+    function, options, rate = ENGINES[engine]
+    options = dict(options)
+    os.environ["JAX_ENABLE_X64"] = "1" if options.pop("x64", True) else "0"
+    if function == "newton":
+        from peer_newton import of_newton
+
+        x, jac, back, seconds = of_newton(name, rate, **options)
+    else:
+        x, jac, back, seconds = of_jax(globals()[function](name, rate, **options), name)
+    return {"x": x.tolist(), "jac": jac.tolist(), "reverse": back, "seconds": seconds}
+
+
+def truths(name):
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    both = jax.vmap(lambda t: (exact(name, t), jax.jacfwd(lambda t: exact(name, t))(t)))(jnp.asarray(thetas(name)))
+    return tuple(np.asarray(part) for part in both)
+
+
+def line(engine, name, found):
+    """One row of the table."""
+    x, jac = truths(name)
+    got, there = np.array(found["jac"], float), np.array(found["x"], float)
+    off = np.linalg.norm((got - jac).reshape(STARTS, -1), axis=1) / np.linalg.norm(jac.reshape(STARTS, -1), axis=1)
+    away = 1e3 * np.abs(there - x).max((1, 2))
+    back = found["reverse"]
+    reverse = "refused" if isinstance(back, str) else "yes" if np.isfinite(back).all() else "NaN"
+    forward = "yes" if np.isfinite(got).all() else "NaN"
+    finite = f"{forward if len(found['seconds']) > 1 else '-'} / {reverse}"
+    slope = f"{np.median(got[:, 0, 1, 1]):8.3f}" if name == "one bounce" else " " * 8
+    seconds = " ".join(f"{s:5.1f}" for s in found["seconds"])
+    return f"{name:12} {engine:24} {np.median(away):9.2g} {slope} {np.median(off):9.1e}  {finite:14} {seconds}"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--python", action="append", default=[], help="ENGINE=PATH of the Python that has it")
+    parser.add_argument("--engines", default=",".join(ENGINES))
+    parser.add_argument("--cases", default=",".join(CASES))
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    if chosen.one:
+        return print("RESULT " + json.dumps(measure(*chosen.one)))
+    pythons = dict(pair.split("=", 1) for pair in chosen.python)
+    env = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    print(f"exact: d y / d y0 of one bounce is {np.median(truths('one bounce')[1][:, 0, 1, 1]):.3f}")
+    print(f"{'':37} {'off [mm]':>9} {'dy/dy0':>8} {'error':>9}  {'finite f / r':14} CPU-s f, r")
+    for name in chosen.cases.split(","):
+        for engine in chosen.engines.split(","):
+            python = pythons.get(ENGINES[engine][0], sys.executable)
+            run = subprocess.run([python, __file__, "--one", engine, name], env=env, capture_output=True, text=True)
+            answers = [text for text in run.stdout.splitlines() if text.startswith("RESULT ")]
+            if answers:
+                print(line(engine, name, json.loads(answers[0].removeprefix("RESULT "))), flush=True)
+            else:
+                reason = (run.stderr.strip().splitlines() or ["no answer"])[-1]
+                print(f"{name:12} {engine:24} left out: {reason[:90]}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
