@@ -130,9 +130,7 @@ def columns(
     shared = None if "t" not in table else _times(table.pop("t"), f'{where}["t"]')
     gathered = _gather(table)
     if shared is None and not any(isinstance(values, tuple) for values in gathered.values()):
-        raise ValueError(
-            f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours'
-        )
+        raise ValueError(f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours')
     found, channels = [], {}
     for name, values in gathered.items():
         channel = channel_of(name, observe.get(name, name), world)
