@@ -32,7 +32,6 @@ nb_execution_mode = "off"
 nb_merge_streams = True
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
-suppress_warnings = ["mystnb.unknown_mime_type"]
 
 default_role = "code"
 autodoc_typehints = "none"  # the docstrings give shapes and units, which say more
