@@ -5,7 +5,7 @@ import time
 import newton
 import numpy as np
 import warp as wp
-from gradients_vs_peers import CASES, DISCS, RADIUS, thetas
+from peer_engines import CASES, DISCS, RADIUS, thetas
 
 
 @wp.kernel
