@@ -34,6 +34,12 @@ def rollout_batch(
 
     Raises:
         ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps < 1.
+
+    Example:
+        >>> thrown = dr.replace(state, v=jnp.array([[[0.0, 0.0]], [[1.0, 0.0]], [[2.0, 0.0]]]))  # (B, N, D)
+        >>> ends = dr.rollout_batch(world, thrown, dt=1 / 60, steps=30, final_only=True)
+        >>> ends.x[:, 0, 0].round(6).tolist()
+        [0.0, 0.5, 1.0]
     """
     _check_leaves(world, state)
     world, state = floats(world, state)

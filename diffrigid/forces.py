@@ -20,7 +20,13 @@ from diffrigid.state import Bodies, State, Wrench, material_point, material_velo
 
 @pytree
 class Gravity:
-    """F = m g."""
+    """F = m g.
+
+    Example:
+        >>> made, start = dr.scene({"ball": ball}, forces={"moon": dr.Gravity(g=(0.0, -1.62))})  # path "moon.g"
+        >>> round(float(dr.step(made, start, 1.0).x[0, 1]), 6)
+        0.19
+    """
 
     g: Leaf = array("D")  # (D, *batch) [m/s^2]
     constant: ClassVar[bool] = True
@@ -34,7 +40,14 @@ class Gravity:
 
 @pytree
 class Drag:
-    """F = -linear * v and tau = -angular * w, on every body: viscous drag, world axes."""
+    """F = -linear * v and tau = -angular * w, on every body: viscous drag, world axes.
+
+    Example:
+        >>> puck = dr.Body(dr.Disc(radius=0.1), mass=2.0, x=(0.0, 0.0), v=(1.0, 0.0))
+        >>> made, start = dr.scene({"puck": puck}, forces=[dr.Drag(linear=0.5)])
+        >>> round(float(dr.step(made, start, 1.0).v[0, 0]), 4), round(float(np.exp(-0.5 / 2.0)), 4)
+        (0.7788, 0.7788)
+    """
 
     linear: Leaf = array("D", default=0.0)  # (D, *batch) [N s/m]; a number stands for all directions
     angular: Leaf = array(default=0.0)  # (*batch) [N m s/rad]
@@ -49,7 +62,14 @@ class Drag:
 
 @pytree
 class Force:
-    """A force at a point fixed to a body; with `control`, plus what `controls[control]` holds, (D, *batch) [N]."""
+    """A force at a point fixed to a body; with `control`, plus what `controls[control]` holds, (D, *batch) [N].
+
+    Example:
+        >>> made, start = dr.scene({"ball": ball}, forces=[dr.Force(body="ball", F=(0.0, 0.0), control="push")])
+        >>> push = jnp.array([[1.0, 0.0], [0.0, 0.0]])  # (T, D) [N] held over a step
+        >>> dr.rollout(made, start, dt=0.5, steps=2, controls={"push": push}).state.v[:, 0, 0].tolist()
+        [0.0, 0.5, 0.5]
+    """
 
     body: str = static()
     F: Leaf = array("D")  # (D, *batch) [N] world axes
@@ -70,7 +90,13 @@ class Force:
 
 @pytree
 class Torque:
-    """A torque on a body; with `control`, plus what `controls[control]` holds, (A, *batch) [N m]."""
+    """A torque on a body; with `control`, plus what `controls[control]` holds, (A, *batch) [N m].
+
+    Example:
+        >>> made, start = dr.scene({"ball": ball}, forces=[dr.Torque(body="ball", tau=0.01)])
+        >>> round(float(dr.step(made, start, 0.5).w[0, 0]), 6)  # I = m r^2 / 2
+        1.0
+    """
 
     body: str = static()
     tau: Leaf = array("A")  # (A, *batch) [N m] world axes
@@ -91,6 +117,12 @@ class SpringDamper:
 
     Anchors are in body axes, from the centre of mass; `b=None` ties to the world, and `anchor_b` is a world
     point. Where the two points coincide the direction, and so the force, is taken as zero.
+
+    Example:
+        >>> spring = dr.SpringDamper(a="ball", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=4 * np.pi**2)
+        >>> made, start = dr.scene({"ball": ball}, forces={"spring": spring})  # paths "spring.stiffness", ...
+        >>> dr.rollout(made, start, dt=0.01, steps=100).state.x[-1, 0].round(4).tolist()  # a period later
+        [0.0, 1.0]
     """
 
     a: str = static()

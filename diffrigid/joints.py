@@ -41,6 +41,13 @@ class Revolute:
 
     Anchors and axes are in body axes, from the centre of mass; for `b=None`, the world, anchor_b is a world
     point. What is not given of b is taken from where the bodies are at the start.
+
+    Example:
+        >>> door = dr.Body(None, mass=9.0, inertia=0.6, x=(0.4, 0.0))
+        >>> hinge = dr.Revolute("door", anchor_a=(-0.4, 0.0), upper=1.5, friction=0.2)
+        >>> made, start = dr.scene({"door": door}, joints={"hinge": hinge})  # path "hinge.friction"
+        >>> made.joints[0].anchor_b.tolist()  # of the world, from where the door is
+        [[0.0, 0.0]]
     """
 
     a: Any = _name()
@@ -73,7 +80,14 @@ class Revolute:
 
 @pytree
 class Ball:
-    """A ball and socket: two points stay together. Fields as in `Revolute`."""
+    """A ball and socket: two points stay together. Fields as in `Revolute`.
+
+    Example:
+        >>> bob = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, -1.0))
+        >>> made, start = dr.scene({"bob": bob}, joints=[dr.Ball("bob", anchor_a=(0.0, 1.0))])
+        >>> made.joint_names  # what was not named is called by its class
+        (('ball',),)
+    """
 
     a: Any = _name()
     b: Any = _name(None)
@@ -86,7 +100,14 @@ class Ball:
 
 @pytree
 class Weld:
-    """Two bodies move as one. Fields as in `Revolute`."""
+    """Two bodies move as one. Fields as in `Revolute`.
+
+    Example:
+        >>> parts = {"plate": dr.replace(puck, v=None), "knob": dr.replace(puck, x=(0.3, 0.0), v=None)}
+        >>> made, start = dr.scene(parts, joints=[dr.Weld("knob", "plate")])  # as they lie
+        >>> made.joints[0].anchor_b.tolist()
+        [[0.3, 0.0]]
+    """
 
     a: Any = _name()
     b: Any = _name(None)
@@ -100,7 +121,14 @@ class Weld:
 
 @pytree
 class Prismatic:
-    """A slider: anchor_a stays on the line through anchor_b along axis_b, and a does not turn against b."""
+    """A slider: anchor_a stays on the line through anchor_b along axis_b, and a does not turn against b.
+
+    Example:
+        >>> slider = dr.Prismatic("puck", axis_b=(1.0, 0.0), lower=-1.0, upper=1.0, speed=0.5, friction=3.0)  # a motor
+        >>> made, start = dr.scene({"puck": puck}, joints=[slider])
+        >>> made.joints[0].anchor_b.tolist(), made.joints[0].q.tolist()  # from the start: 0 of the way, and no turn
+        ([[0.0, 0.0]], [[1.0, 0.0]])
+    """
 
     a: Any = _name()
     b: Any = _name(None)
@@ -128,7 +156,14 @@ class Prismatic:
 
 @pytree
 class Distance:
-    """A massless rod between two points. Fields as in `Revolute`."""
+    """A massless rod between two points. Fields as in `Revolute`.
+
+    Example:
+        >>> rod = dr.Distance("ball", anchor_b=(0.0, 3.0))
+        >>> made, start = dr.scene({"ball": ball}, joints=[rod])
+        >>> made.joints[0].length.tolist()  # as at the start
+        [2.0]
+    """
 
     a: Any = _name()
     b: Any = _name(None)

@@ -50,6 +50,11 @@ class Body:
         x: [m] centre of mass. v: [m/s]. w: [rad/s], world frame, a number in 2D.
         angle: [rad] (2D), or q: (cos, sin) in 2D, unit quaternion (w, x, y, z) in 3D. Default: unturned.
         restitution, friction and the other coefficients: default: those of the scene.
+
+    Example:
+        >>> rod = dr.Body(dr.Box(half=(0.5, 0.0)), mass=3.0, x=(0.0, 0.0))  # thin: no area, so no density
+        >>> round(float(dr.scene({"rod": rod})[0].bodies.inertia[0]), 6)  # m l^2 / 12, of its shape
+        0.25
     """
 
     shape: Shape | None
@@ -70,7 +75,14 @@ class Body:
 
 @dataclass(frozen=True)
 class Static:
-    """A shape that does not move, its origin at x [m], turned by angle [rad] (2D) or q."""
+    """A shape that does not move, its origin at x [m], turned by angle [rad] (2D) or q.
+
+    Example:
+        >>> slope = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)), angle=-0.2, friction=0.5)  # falls to the right
+        >>> made, _ = dr.scene({"ball": ball, "slope": slope}, friction=0.1)
+        >>> made.statics.friction.tolist()  # of their contact too: the ball has none of its own
+        [0.5]
+    """
 
     shape: Shape
     x: Any = None
@@ -118,6 +130,13 @@ def scene(
     Warns:
         UserWarning: bodies that overlap at the start, and velocities that do not fit the joints: the first step
             then begins with the impulse that makes them fit.
+
+    Example:
+        >>> ball = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0))
+        >>> floor = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+        >>> world, state = dr.scene({"ball": ball, "floor": floor}, gravity=(0.0, -9.81), restitution=0.8)
+        >>> world.names, world.static_names, state.x.shape  # arrays hold what moves
+        (('ball',), ('floor',), (1, 2))
     """
     moving, still = _sorted(bodies)
     everything: dict[str, Body | Static] = {**moving, **still}

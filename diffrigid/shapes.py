@@ -30,28 +30,51 @@ _BESIDE = {*_CUBE_EDGES, *((j, i) for i, j in _CUBE_EDGES)}
 
 @pytree
 class Disc:
-    """Disc in 2D, centred on the origin."""
+    """Disc in 2D, centred on the origin.
+
+    Example:
+        >>> dr.Disc(radius=0.1).radius  # what can be fitted as "ball.shape.radius"
+        0.1
+    """
 
     radius: Leaf = array()  # (*batch) [m] > 0
 
 
 @pytree
 class Sphere:
-    """Ball in 3D, centred on the origin."""
+    """Ball in 3D, centred on the origin.
+
+    Example:
+        >>> made, _ = dr.scene({"ball": dr.Body(dr.Sphere(radius=0.1), mass=1.0, x=(0.0, 0.0, 0.0))})
+        >>> made.bodies.inertia[0].diagonal().round(6).tolist()  # 2 m r^2 / 5
+        [0.004, 0.004, 0.004]
+    """
 
     radius: Leaf = array()  # (*batch) [m] > 0
 
 
 @pytree
 class Box:
-    """Rectangle (2D) or cuboid (3D) along the axes, centred on the origin; a zero extent makes it thin."""
+    """Rectangle (2D) or cuboid (3D) along the axes, centred on the origin; a zero extent makes it thin.
+
+    Example:
+        >>> cube = dr.Body(dr.Box(half=(0.5, 0.5, 0.5)), density=700.0, x=(0.0, 0.0, 1.0))  # three numbers: 3D
+        >>> round(float(dr.scene({"cube": cube})[0].bodies.mass[0]), 3)
+        700.0
+    """
 
     half: Leaf = array("D")  # (D, *batch) [m] >= 0, half of each side
 
 
 @pytree
 class Capsule:
-    """Segment from (-half_length, 0[, 0]) to (half_length, 0[, 0]), rounded by `radius`. In 2D a stadium."""
+    """Segment from (-half_length, 0[, 0]) to (half_length, 0[, 0]), rounded by `radius`. In 2D a stadium.
+
+    Example:
+        >>> stadium = dr.Body(dr.Capsule(radius=0.5, half_length=1.0), density=1.0, x=(0.0, 0.0))
+        >>> round(float(dr.scene({"stadium": stadium})[0].bodies.mass[0]), 4)  # 2 x 1 and a disc
+        2.7854
+    """
 
     radius: Leaf = array()  # (*batch) [m] >= 0; 0 is a thin rod
     half_length: Leaf = array()  # (*batch) [m] > 0, without the round ends
@@ -59,14 +82,28 @@ class Capsule:
 
 @pytree
 class Polygon:
-    """Strictly convex polygon in 2D, its vertices counter-clockwise."""
+    """Strictly convex polygon in 2D, its vertices counter-clockwise.
+
+    Example:
+        >>> corner = dr.Polygon(vertices=((0.0, 0.0), (3.0, 0.0), (0.0, 3.0)))
+        >>> made, start = dr.scene({"corner": dr.Body(corner, density=1.0, x=(5.0, 5.0))})
+        >>> made.offsets[0].r.tolist()  # its origin, from x, the centre of mass
+        [[-1.0, -1.0]]
+    """
 
     vertices: Leaf = array("V", "D")  # (V, 2, *batch) [m], V >= 3
 
 
 @pytree
 class Hull:
-    """Convex polyhedron in 3D, each of its vertices a corner. `with_topology` fills in faces and edges."""
+    """Convex polyhedron in 3D, each of its vertices a corner. `with_topology` fills in faces and edges.
+
+    Example:
+        >>> tetrahedron = dr.Hull(vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)))
+        >>> made, _ = dr.scene({"die": dr.Body(tetrahedron, density=6.0, x=(0.0, 0.0, 0.0))})
+        >>> round(float(made.bodies.mass[0]), 6), len(made.shapes[0].edges)
+        (1.0, 6)
+    """
 
     vertices: Leaf = array("V", "D")  # (V, 3, *batch) [m], V >= 4
     faces: tuple | None = static(None)  # triples of vertices, counter-clockwise seen from outside; see hull_faces
@@ -75,7 +112,14 @@ class Hull:
 
 @pytree
 class HalfSpace:
-    """The solid {r : normal . r <= offset}, 2D or 3D. For bodies that do not move."""
+    """The solid {r : normal . r <= offset}, 2D or 3D. For bodies that do not move.
+
+    Example:
+        >>> low = dr.Static(dr.HalfSpace(normal=(0.0, 1.0), offset=-2.0))  # the solid is y <= -2
+        >>> made, start = dr.scene({"ball": ball, "floor": low}, gravity=(0.0, -9.81), restitution=1.0)
+        >>> round(float(dr.step(made, start, 2 * np.sqrt(2 * 2.9 / 9.81)).x[0, 1]), 6)  # down 2.9 m and up again
+        1.0
+    """
 
     normal: Leaf = array("D")  # (D, *batch) unit vector out of the solid
     offset: Leaf = array(default=0.0)  # (*batch) [m]
@@ -83,7 +127,14 @@ class HalfSpace:
 
 @pytree
 class Profile:
-    """The solid below a polyline in 2D, which goes on straight beyond its ends. For bodies that do not move."""
+    """The solid below a polyline in 2D, which goes on straight beyond its ends. For bodies that do not move.
+
+    Example:
+        >>> step = dr.Profile(points=((0.0, 0.0), (1.0, 0.0), (1.1, 0.2), (2.0, 0.2)))
+        >>> made, _ = dr.scene({"ball": ball, "ground": dr.Static(step)}, gravity=(0.0, -9.81))
+        >>> made.shapes[1].points.shape  # fitted as "ground.shape.points"
+        (1, 4, 2)
+    """
 
     points: Leaf = array("V", "D")  # (V, 2, *batch) [m], V >= 3, from left to right
 

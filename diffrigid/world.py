@@ -32,6 +32,11 @@ class World:
     Colliders are numbered bodies first, then statics. Shapes of one kind are stacked in one record, with a
     leading axis; `owners` says on which collider each sits, and `offsets` where, if its origin is not the
     centre of mass. Make it with `scene`; change it with `replace`.
+
+    Example:
+        >>> heavy = dr.replace(world, bodies=dr.replace(world.bodies, mass=2.0 * world.bodies.mass))
+        >>> heavy.bodies.mass.tolist(), world.bodies.mass.tolist()  # a world does not change
+        ([2.0], [1.0])
     """
 
     bodies: Bodies
@@ -94,7 +99,13 @@ def shape_of_leaf(leaf: Any, path: str) -> tuple[int, ...]:
 
 
 def check(world: World, state: State) -> None:
-    """Raise ValueError where shapes or types of `state` and `world` do not fit. Costs nothing at run time."""
+    """Raise ValueError where shapes or types of `state` and `world` do not fit. Costs nothing at run time.
+
+    Example:
+        >>> dr.check(world, dr.replace(state, w=jnp.zeros((1, 3))))
+        Traceback (most recent call last):
+        ValueError: state.w has shape (1, 3), expected (N=1, A=1, *batch) in this 2D world of 1 bodies: ...
+    """
     check_kinds(world, state)
     refuse_missing(state, "state")
     sizes = axis_sizes(world)

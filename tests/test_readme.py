@@ -3,11 +3,27 @@
 import re
 from pathlib import Path
 
+import numpy as np
+
 README = (Path(__file__).parent.parent / "README.md").read_text()
+EXAMPLE, FROM_A_FILE = re.findall(r"```python\n(.*?)```", README, flags=re.S)
 
 
 def test_example_runs(capsys):
-    (example,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
-    exec(compile(example, "README.md", "exec"), {})
+    exec(compile(EXAMPLE, "README.md", "exec"), {})
     table = capsys.readouterr().out
     assert "restitution" in table and "ball.mass" in table
+
+
+def test_example_with_a_file_finds_what_made_it(tmp_path, monkeypatch):
+    """A ball that bounces once, with 2 mm of noise."""
+    monkeypatch.chdir(tmp_path)
+    t, e, fall = np.arange(55) / 60, 0.75, np.sqrt(2 * 1.15 / 9.81)
+    height = np.where(t < fall, 1.15 - 4.905 * t**2, 9.81 * e * fall * (t - fall) - 4.905 * (t - fall) ** 2)
+    seen = np.stack([0.4 * t, 0.05 + height], axis=1) + 2e-3 * np.random.default_rng(0).normal(size=(55, 2))
+    head = re.search(r"t,ball.*", README)[0]
+    np.savetxt("drop.csv", np.column_stack([12.5 + t, seen]), delimiter=",", header=head, comments="", fmt="%.4f")
+    found = {}
+    exec(compile(FROM_A_FILE, "README.md", "exec"), found)
+    values = found["fit"]["restitution"]
+    assert values.low < e < values.high < values.low + 0.01 and Path("fit.html").exists()

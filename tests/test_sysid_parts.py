@@ -148,6 +148,14 @@ def test_tables_files_and_dictionaries_say_the_same(tmp_path):
         assert np.isnan(angle.values[2]).all() == (not isinstance(data, Table))
 
 
+def test_a_file_as_spreadsheets_write_it(tmp_path):
+    (tmp_path / "marked.csv").write_bytes(b"\xef\xbb\xbft,cue.x[0]\r\n0,1\r\n1,2\r\n")
+    assert list(read_csv(tmp_path / "marked.csv")) == ["t", "cue.x[0]"]
+    (tmp_path / "semicolons.csv").write_text("t;cue.x[0]\n0,5;1,5\n")
+    with pytest.raises(ValueError, match="sep=';'.*decimal=','"):
+        read_csv(tmp_path / "semicolons.csv")
+
+
 def test_columns_may_have_times_of_their_own():
     slow = T[::2] + 0.03
     series, _ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
@@ -161,6 +169,7 @@ GOOD = {"t": T, "cue.x": np.zeros((6, 2))}
     ("data", "arguments", "message"),
     [
         ({"cue.x": np.zeros((6, 2))}, {}, 'expected a column "t"'),
+        ({"time": T, "cue.x": np.zeros((6, 2))}, {}, r"got \['time', 'cue.x'\]; rename"),
         (GOOD | {"t": T[::-1]}, {}, "increasing times"),
         (GOOD | {"cue.x": np.zeros((6, 3))}, {}, r"expected \(6, 2\) like t in this 2D world"),
         (GOOD | {"cue.x[0]": T}, {}, "leave one out"),

@@ -54,6 +54,12 @@ class Contact:
 
     Differentiable at width > 0 wherever the paths are; at width = 0 with kinks where an impact appears or
     vanishes (grazing), where two coincide, and where sticking turns to slipping.
+
+    Example:
+        >>> widths = [dr.replace(world, contact=dr.Contact(width=width)) for width in (0.2, 0.05, 0.0)]
+        >>> ends = [dr.rollout(w, state, dt=1 / 60, steps=30).state.x[-1, 0, 1] for w in widths]  # compiled once
+        >>> [round(float(y), 4) for y in ends]  # full hits stay; near misses pull
+        [0.3157, 0.3157, 0.3157]
     """
 
     width: Leaf = array(default=0.0)

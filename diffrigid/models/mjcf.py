@@ -66,6 +66,14 @@ def load_mjcf(path: str | Path, *, restitution: Any = 0.0, contact: Contact | No
     Warns:
         UserWarning: names all that is left out: meshes, cylinders and ellipsoids do not collide, a body collides with
             one geom that is centred at its centre of mass; actuators, tendons, springs of joints, armature.
+
+    Example:
+        >>> text = '''<mujoco><worldbody><geom name="ground" type="plane" size="1 1 1" friction="0.6"/><body name="ball"
+        ... pos="0 0 1"><freejoint/><geom type="sphere" size="0.1" mass="1"/></body></worldbody></mujoco>'''
+        >>> _ = Path("ball.xml").write_text(text)
+        >>> made, start = dr.load_mjcf("ball.xml", restitution=0.7)
+        >>> made.names, made.static_names, made.statics.friction.tolist(), made.bodies.friction.tolist()
+        (('ball',), ('ground',), [0.6], [1.0])
     """
     where, root = str(path), read_xml(path, "mujoco")
     _include(root, Path(path).parent, (Path(path).resolve(),))

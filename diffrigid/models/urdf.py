@@ -37,6 +37,14 @@ def load_urdf(
 
     Warns:
         UserWarning: names all that is left out: meshes and cylinders do not collide, nor shapes off the centre of mass.
+
+    Example:
+        >>> text = '''<robot name="r"><link name="rod"><inertial><mass value="2"/><origin xyz="0 0 -0.5"/>
+        ... <inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'''
+        >>> _ = Path("rod.urdf").write_text(text)
+        >>> made, start = dr.load_urdf("rod.urdf", floating=True)
+        >>> made.names, start.x.tolist()  # x is the centre of mass
+        (('rod',), [[0.0, 0.0, -0.5]])
     """
     where, root = str(path), read_xml(path, "robot")
     left_out: list[str] = [f"{e.tag}" for e in root if e.tag not in ("link", "joint", *QUIET)]

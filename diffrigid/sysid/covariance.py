@@ -58,6 +58,11 @@ def sandwich(linear: Linear) -> Uncertainty:
 
     Leaves out each record in turn, to first order; with one record, each of 20 pieces of its time, which is right if
     residuals of different pieces are independent. Source: jackknife of clusters, CR3 of Bell and McCaffrey 2002.
+
+    Example:
+        >>> careful = found.with_intervals(dr.sandwich)["restitution"]  # of one record: by pieces of its time
+        >>> bool(careful.low < 0.8 < careful.high)
+        True
     """
     H, pull = _clusters(linear)
     total, count = sum(H), len(H)
@@ -67,7 +72,13 @@ def sandwich(linear: Linear) -> Uncertainty:
 
 
 def bootstrap(linear: Linear) -> Uncertainty:
-    """Spread of the fit over clusters drawn again with replacement, 2000 times, one Gauss-Newton step each."""
+    """Spread of the fit over clusters drawn again with replacement, 2000 times, one Gauss-Newton step each.
+
+    Example:
+        >>> again = found.with_intervals(dr.bootstrap)["restitution"]  # of one record: its pieces
+        >>> bool(again.low < 0.8 < again.high)
+        True
+    """
     H, pull = _clusters(linear)
     count = len(H)
     times = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=DRAWS).astype(float)

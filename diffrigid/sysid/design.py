@@ -43,6 +43,13 @@ def expected_intervals(
     Args:
         planned: "t" and the columns, with None for values, or NaN where nothing will be measured.
         noise: standard deviation of every column.
+
+    Example:
+        >>> planned = {"t": np.linspace(0.0, 1.0, 11), "ball.x": None}
+        >>> one = {"spring.stiffness": dr.positive()}
+        >>> (told,) = dr.sysid.expected_intervals(made, start, planned, free=one, noise={"ball.x": 1e-3})
+        >>> round(float(told.high - told.low), 3)  # [N/m]
+        0.039
     """
     problem = _problem(world, state, [state], planned, free, noise, observe, dt)
     return _parameters(problem, 0, _linears(problem)[0])
@@ -52,7 +59,15 @@ def blind_spots(
     world: World, state: State, observations: Any, *, free: Mapping[Any, Any], noise: Mapping[str, Any] | None = None,
     observe: Mapping[str, Any] | None = None, dt: float | None = None,
 ) -> tuple[str, ...]:  # fmt: skip
-    """What these observations cannot tell, in words, before any fit: at the values of the scene. Arguments of `fit`."""
+    """What these observations cannot tell, in words, before any fit: at the values of the scene. Arguments of `fit`.
+
+    Example:
+        >>> made, start = dr.scene({"ball": ball}, forces={"spring": spring})
+        >>> seen = {"t": np.linspace(0.0, 1.0, 11), "ball.x": np.zeros((11, 2))}  # values do not matter
+        >>> both = {"ball.mass": dr.positive(), "spring.stiffness": dr.positive()}
+        >>> dr.sysid.blind_spots(made, start, seen, free=both)
+        ('only the ratio ball.mass / spring.stiffness is seen',)
+    """
     problem = make_problem(world, state, observations, free=free, noise=noise, observe=observe, dt=dt)
     linear = linear_of(problem, point_at(problem.groups, make_starts(problem, 1, 0)), 0, Squares(), False)
     slots = (*problem.shared, *problem.own)

@@ -81,6 +81,14 @@ def fit(
 
     Interrupting it returns the best so far. Raises:
         ValueError: unknown names, wrong shapes, or a parameter that nothing measured depends on.
+
+    Example:
+        >>> noise = np.random.default_rng(0).normal(size=(31, 2))
+        >>> measured = {"t": np.asarray(trajectory.t), "ball.x": np.asarray(trajectory.state.x[:, 0]) + 1e-3 * noise}
+        >>> guess, start = dr.scene({"ball": ball, "floor": floor}, gravity=(0.0, -9.81), restitution=0.3)
+        >>> found = dr.fit(guess, start, measured, free={"restitution": dr.interval(0, 1)}, progress=False)
+        >>> round(float(found["restitution"].value), 2), round(found.noise["ball.x"], 4)
+        (0.8, 0.0009)
     """
     began = time.time()
     at_least_one("starts", starts), at_least_one("iterations", iterations)

@@ -124,7 +124,12 @@ class Prior:
 
 
 def interval(low: float, high: float) -> Free:
-    """A parameter between two bounds."""
+    """A parameter between two bounds.
+
+    Example:
+        >>> dr.interval(0, 2).value(np.array([-50.0, 0.0, 50.0])).round(3)  # of what is fitted, which has no bounds
+        array([0., 1., 2.])
+    """
     low, high = (float(known_number(f"interval: {end}", value)) for end, value in (("low", low), ("high", high)))
     if not low < high:
         raise ValueError(f"interval({low}, {high}): expected low < high")
@@ -132,42 +137,86 @@ def interval(low: float, high: float) -> Free:
 
 
 def positive(spread: float = 0.5) -> Free:
-    """A parameter > 0; random starts are a factor exp(spread N(0, 1)) away."""
+    """A parameter > 0; random starts are a factor exp(spread N(0, 1)) away.
+
+    Example:
+        >>> dr.positive().value(np.array([-50.0, 0.0, 1.0])).round(3)  # exp of what is fitted
+        array([0.   , 1.   , 2.718])
+    """
     return Free(low=0.0, spread=_spread(spread))
 
 
 def real(spread: float = 0.5) -> Free:
-    """Any number; random starts are spread * max(rms, 1) N(0, 1) away."""
+    """Any number; random starts are spread * max(rms, 1) N(0, 1) away.
+
+    Example:
+        >>> dr.real(spread=0.1).draw(np.array([3.0, 4.0]), np.random.default_rng(0)).round(2)  # a random start
+        array([3.04, 3.95])
+    """
     return Free(spread=_spread(spread))
 
 
 def direction(spread: float = 0.5) -> Chart:
-    """A vector of which only the direction varies, by an angle in 2D and by two in 3D: {"gravity": direction()}."""
+    """A vector of which only the direction varies, by an angle in 2D and by two in 3D: {"gravity": direction()}.
+
+    Example:
+        >>> down = dr.direction().value(jnp.array([0.3]), jnp.array([0.0, -9.81]))  # turned by 0.3 rad
+        >>> round(float(jnp.hypot(*down)), 6)
+        9.81
+    """
     return Chart(name="direction", size_of=_direction_size, map=_turned_vector, spread=_spread(spread))
 
 
 def rotation(spread: float = 0.5) -> Chart:
-    """An orientation, turned by exp(z) in world axes, one angle in 2D and three in 3D: {"die.q": rotation()}."""
+    """An orientation, turned by exp(z) in world axes, one angle in 2D and three in 3D: {"die.q": rotation()}.
+
+    Example:
+        >>> dr.rotation().value(jnp.array([np.pi / 2]), jnp.array([1.0, 0.0])).round(6).tolist()
+        [0.0, 1.0]
+    """
     return Chart(name="rotation", size_of=_rotation_size, map=_turned, spread=_spread(spread))
 
 
 def inertia(spread: float = 0.3) -> Chart:
-    """A (3, 3) inertia that stays one of a mass distribution: {"die.inertia": inertia()}."""
+    """A (3, 3) inertia that stays one of a mass distribution: {"die.inertia": inertia()}.
+
+    Example:
+        >>> flat = dr.inertia().value(jnp.array([-50.0, 0.0, 0.0, 0.0, 0.0, 0.0]), jnp.eye(3))
+        >>> flat.diagonal().round(6).tolist()  # of a plate; none can be larger than the sum of the others
+        [1.0, 0.5, 0.5]
+    """
     return Chart(name="inertia", size_of=_inertia_size, map=_physical_inertia, spread=_spread(spread))
 
 
 def shares(spread: float = 0.5) -> Chart:
-    """Ratios of several numbers: {("cue.mass", "ball.mass"): shares()} keeps the sum of both."""
+    """Ratios of several numbers: {("cue.mass", "ball.mass"): shares()} keeps the sum of both.
+
+    Example:
+        >>> masses = dr.shares().value(jnp.array([np.log(3.0)]), jnp.array([1.0, 1.0]))  # impacts tell the ratio only
+        >>> masses.round(6).tolist()
+        [0.5, 1.5]
+    """
     return Chart(name="shares", size_of=_shares_size, map=_same_sum, spread=_spread(spread))
 
 
 def each(kind: Any) -> Each:
-    """Of many records, each with its own value: {"ball.v": each(real())}."""
+    """Of many records, each with its own value: {"ball.v": each(real())}.
+
+    Example:
+        >>> own = {"restitution": dr.interval(0, 1), "ball.v": dr.each(dr.real())}
+        >>> dr.sysid.make_problem(world, state, [measured] * 3, free=own).sizes  # shared numbers, those of each record
+        (1, 2)
+    """
     return Each(kind=kind)
 
 
 def prior(kind: Any, mean: Any, deviation: Any) -> Prior:
-    """A Gaussian prior beside the data: {"ball.mass": prior(positive(), 1.2, 0.1)}."""
+    """A Gaussian prior beside the data: {"ball.mass": prior(positive(), 1.2, 0.1)}.
+
+    Example:
+        >>> dr.prior(dr.positive(), 1.2, 0.1).mean, dr.prior(dr.real(), (0.0, 1.0), 0.1).deviation
+        ((1.2,), (0.1,))
+    """
     means, deviations = numbers("prior: mean", mean, None).ravel(), numbers("prior: deviation", deviation, None).ravel()
     if not (deviations > 0).all():
         raise ValueError(f"prior: deviation is {deviation}, expected > 0, in the unit of the parameter")

@@ -57,12 +57,22 @@ def squares() -> Squares:
 
 
 def huber(at: float = 1.345) -> Huber:
-    """Quadratic up to `at` standard deviations, straight beyond; 1.345 has 95 % of the efficiency in normal noise."""
+    """Quadratic up to `at` standard deviations, straight beyond; 1.345 has 95 % of the efficiency in normal noise.
+
+    Example:
+        >>> dr.huber().rho(jnp.array([1.0, 10.0])).round(3).tolist()  # squares: 0.5, 50
+        [0.5, 12.545]
+    """
     return Huber(at=_above_zero("huber", at))
 
 
 def student(nu: float = 4.0) -> Student:
-    """Heavy tails: nu degrees of freedom."""
+    """Heavy tails: nu degrees of freedom.
+
+    Example:
+        >>> dr.student(nu=4.0).rho(jnp.array([1.0, 10.0])).round(3).tolist()  # squares: 0.5, 50
+        [0.558, 8.145]
+    """
     return Student(nu=_above_zero("student", nu))
 
 

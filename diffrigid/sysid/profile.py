@@ -45,6 +45,11 @@ def profile(fit: Fit, name: str, points: int = 9) -> Profile:
 
     Args:
         points: an odd number of values, the fitted one in the middle; more follow where the interval is wide.
+
+    Example:
+        >>> curve = dr.profile(found, "restitution")
+        >>> bool(curve.low < 0.8 < curve.high), curve.open  # open: where the data give no limit
+        (True, ())
     """
     index = _index(fit, name)
     kind: Any = next(slot.kind for slot in fit.problem.shared if slot.name == name)

@@ -27,6 +27,11 @@ class Record:
         state: its own initial state; default that of `fit`. world: likewise.
         start: [s] time of the initial state; default the first time of its columns.
         noise: standard deviations of its columns, numbers or arrays like the columns; default those of `fit`.
+
+    Example:
+        >>> drops = [dr.Record(measured), dr.Record(measured, state=state, noise={"ball.x": 1e-3})]
+        >>> drops[0].state is None  # then that of the fit
+        True
     """
 
     observations: Any
@@ -124,6 +129,8 @@ def columns(
         raise ValueError(f"{where} has a column {odd[0]!r}: expected names of columns, such as 'ball.x'")
     shared = None if "t" not in table else _times(table.pop("t"), f'{where}["t"]')
     gathered = _gather(table)
+    if shared is None and not any(isinstance(values, tuple) for values in gathered.values()):
+        raise ValueError(f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours')
     found, channels = [], {}
     for name, values in gathered.items():
         channel = channel_of(name, observe.get(name, name), world)
@@ -147,13 +154,18 @@ def columns(
 def read_csv(path: str | Path) -> dict[str, np.ndarray]:
     """Columns of a file with one line of names; an empty cell is missing."""
     try:
-        with open(path, newline="", encoding="utf-8") as file:
+        with open(path, newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is no CSV file: {error}") from None
     if not rows:
         raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
     names, body = [name.strip() for name in rows[0]], rows[1:]
+    if len(names) == 1 and (other := next((mark for mark in ";\t" if mark in names[0]), None)):
+        raise ValueError(
+            f"{path} has {other!r} between its columns: expected commas, and points in numbers; give `fit` the table "
+            f"pandas.read_csv({str(path)!r}, sep={other!r}), with decimal=',' if numbers have commas"
+        )
     for number, row in enumerate(body, start=2):
         if len(row) != len(names):
             raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)} like the names")

@@ -26,7 +26,12 @@ FRAMES = 5  # rows of a column that a guess of its start is made from
 
 
 def segments(world: World, state: State, observations: Any, count: int) -> list[Record]:
-    """Pieces of equal duration, with initial states guessed from the first rows of their "x" and "angle" columns."""
+    """Pieces of equal duration, with initial states guessed from the first rows of their "x" and "angle" columns.
+
+    Example:
+        >>> [piece.start for piece in dr.segments(world, state, measured, 3)]
+        [0.0, 0.16666666666666666, 0.3333333333333333]
+    """
     check(world, state)
     at_least_one("count", count)
     series, channels = columns(world, observations, {})

@@ -48,7 +48,12 @@ class Part:
 
 @pytree
 class Marker:
-    """World position of a point fixed to a body, (D,) [m]."""
+    """World position of a point fixed to a body, (D,) [m].
+
+    Example:
+        >>> dr.Marker(0, point=jnp.array([0.1, 0.0]))(state).tolist()  # for `fit` by name: Marker("ball", point=...)
+        [0.1, 1.0]
+    """
 
     body: Any = _first({"static": True})
     point: Leaf = array("D", default=0.0)  # (D, *batch) [m] body axes, from the centre of mass
@@ -59,7 +64,13 @@ class Marker:
 
 @pytree
 class Separation:
-    """Distance between two observed points, (1,) [m]; each a Marker or the name of a body."""
+    """Distance between two observed points, (1,) [m]; each a Marker or the name of a body.
+
+    Example:
+        >>> ends = (dr.Marker(0, point=jnp.array(point)) for point in ((0.3, 0.0), (0.0, 0.4)))
+        >>> round(float(dr.Separation(*ends)(state)[0]), 6)  # for `fit` by name: Separation("cue", "ball")
+        0.5
+    """
 
     a: Any = _first()
     b: Any = _first()
@@ -70,7 +81,13 @@ class Separation:
 
 @pytree
 class Homography:
-    """Pixels of a point of the plane in a camera that looks at it: (u, v) = (h0, h1) / h2, h = matrix (x, y, 1)."""
+    """Pixels of a point of the plane in a camera that looks at it: (u, v) = (h0, h1) / h2, h = matrix (x, y, 1).
+
+    Example:
+        >>> camera = jnp.array([[100.0, 0.0, 320.0], [0.0, -100.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> dr.Homography(dr.Marker(0, point=jnp.zeros(2)), matrix=camera)(state).tolist()
+        [320.0, 140.0]
+    """
 
     of: Any = _first()
     matrix: Leaf = array("H", "H")  # (3, 3, *batch)
@@ -83,7 +100,14 @@ class Homography:
 
 @pytree
 class Pinhole:
-    """Pixels of a point of space: (u, v) = focal (X, Y) / Z + center, in camera axes x right, y down, z forward."""
+    """Pixels of a point of space: (u, v) = focal (X, Y) / Z + center, in camera axes x right, y down, z forward.
+
+    Example:
+        >>> lens = {"x": jnp.array([0.0, 0.0, -2.0]), "q": jnp.array([1.0, 0.0, 0.0, 0.0]), "focal": jnp.asarray(500.0)}
+        >>> seen = dr.Pinhole(lambda _: jnp.array([0.1, 0.0, 0.0]), center=jnp.array([320.0, 240.0]), **lens)
+        >>> seen(None).tolist()  # 0.1 m to its right, 2 m before it
+        [345.0, 240.0]
+    """
 
     of: Any = _first()
     x: Leaf = array("D")  # (3, *batch) [m] of the camera
@@ -109,7 +133,14 @@ class Function:
 
 @pytree
 class Channel:
-    """One column: what it observes, and its instrument."""
+    """One column: what it observes, and its instrument.
+
+    Example:
+        >>> tip = dr.Channel(dr.Marker("ball", point=(0.1, 0.0)), clock=0.02)
+        >>> columns, late = {"t": measured["t"], "tip": measured["ball.x"]}, {"tip.clock": dr.real()}
+        >>> dr.sysid.make_problem(world, state, columns, free=late, observe={"tip": tip}).shared[0].name
+        'tip.clock'
+    """
 
     observer: Any = _first()
     bias: Leaf = array("M", default=0.0)  # (size, *batch) in the unit of the column

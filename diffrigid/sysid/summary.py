@@ -62,7 +62,13 @@ class Summary:
 
 
 def load_fit(path: str | Path) -> Summary:
-    """What `save` wrote: the table, and with `fit(..., resume=...)` where to go on from."""
+    """What `save` wrote: the table, and with `fit(..., resume=...)` where to go on from.
+
+    Example:
+        >>> saved = dr.load_fit(found.save("fit.json"))  # the table; a fit goes on from it by resume=saved
+        >>> bool(saved["restitution"].value == found["restitution"].value)
+        True
+    """
     content = Path(path).read_bytes()
     try:
         data = json.loads(content)

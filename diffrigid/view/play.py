@@ -40,7 +40,12 @@ UNPACK = """(async () => {
 
 @dataclass(frozen=True)
 class Player:
-    """A page that plays; a notebook shows it by itself."""
+    """A page that plays; a notebook shows it by itself.
+
+    Example:
+        >>> dr.play({"exact": trajectory, "smooth": dr.rollout(widths[0], state, dt=1 / 60, steps=30)}).height
+        520
+    """
 
     page: str  # HTML
     height: int  # [px] in a notebook
@@ -89,6 +94,11 @@ def play(
 
     Raises:
         ValueError: a batch of trajectories, dimensions that differ, unknown columns or names.
+
+    Example:
+        >>> page = dr.play(trajectory, measured, plot="y")  # shown by itself in a notebook
+        >>> page.save("motion.html").name
+        'motion.html'
     """
     runs = (
         {str(name): checked(run, f"trajectory[{name!r}]") for name, run in trajectory.items()}

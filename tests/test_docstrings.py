@@ -1,0 +1,41 @@
+"""Examples of the docstrings run, in the order of the reference, as one session; every public name has one."""
+
+import doctest
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import diffrigid as dr
+
+PAGE = (Path(__file__).parent.parent / "notebooks" / "api.md").read_text()
+NAMES = re.findall(r"\.\. auto(?:function|class):: (\w+)", PAGE)
+ELSEWHERE = {"replace"}  # that of `dataclasses`
+MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"}
+
+
+def examples():
+    """Of every name on the page that has one."""
+    parser = doctest.DocTestParser()
+    for name in NAMES:
+        public = getattr(dr, name, None) or getattr(dr.sysid, name)
+        example = parser.get_doctest(public.__doc__, {}, name, None, 0)
+        if example.examples:
+            yield example
+
+
+def test_every_public_name_has_one():
+    assert set(dr.__all__) - {example.name for example in examples()} == ELSEWHERE
+    assert set(NAMES) - {example.name for example in examples()} == MORE
+
+
+def test_examples_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    session = {"dr": dr, "jax": jax, "jnp": jnp, "np": np, "Path": Path}
+    runner, wrong = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS), []
+    for example in examples():
+        example.globs = session
+        runner.run(example, out=wrong.append, clear_globs=False)
+    assert not wrong, "".join(wrong)
