@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-
 SHARE = PartitionSpec("devices")
 
 
@@ -27,7 +26,7 @@ def over_devices(fn: Callable, parts: Any, whole: Any) -> Any:
     """fn(parts, whole), each device with its share.
 
     Args:
-        parts: arrays that are divided along their leading axis, a multiple of the number of devices; so are the results.
+        parts: arrays divided along their leading axis, a multiple of the number of devices; so are the results.
         whole: what every device gets all of; its derivatives are added up.
     """
     if len(devices()) == 1:

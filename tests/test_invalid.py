@@ -252,6 +252,8 @@ RUNS = {
     "batch dt": (lambda v: dr.rollout_batch(*many(), dt=v, steps=1), (*POSITIVE, None)),
     "batch steps": (lambda v: dr.rollout_batch(*many(), dt=0.1, steps=v), INTEGER),
     "batch chunk": (lambda v: dr.rollout_batch(*many(), dt=0.1, steps=1, chunk=v), tuple(v for v in INTEGER if v is not None and v is not HUGE)),
+    "rollout memory": (lambda v: roll(steps=1, memory=v), tuple(v for v in INTEGER if v is not HUGE)),
+    "batch memory": (lambda v: dr.rollout_batch(*many(), dt=0.1, steps=1, memory=v), tuple(v for v in INTEGER if v is not HUGE)),
     "play": (dr.play, (*RECORD, None, {"a": 1.0}, {})),
 }  # fmt: skip
 FITS = {

@@ -167,7 +167,7 @@ def _side_by_side(leaves: Sequence[Any]) -> np.ndarray:
 
 
 def residuals(plan: Plan, z: Array, data: Data) -> Array:
-    """Weighted residuals (m, B) of B lanes z (n, B), which the devices share; arrays of `data` have a last axis of 1 or B.
+    """Weighted residuals (m, B) of B lanes z (n, B), among the devices; arrays of `data` have a last axis of 1 or B.
 
     Rows of priors come last, shared among the records so that their squares sum to one prior.
     """
