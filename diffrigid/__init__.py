@@ -5,7 +5,7 @@ S statics, C contacts, P pairs, K contacts of a pair, T time steps; trailing bat
 """
 
 from diffrigid.batch import rollout_batch
-from diffrigid.contact import Contact
+from diffrigid.contact import Contact, missed_pairs
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.models import load_mjcf, load_urdf
@@ -100,6 +100,7 @@ __all__ = [
     "load_urdf",
     "material_point",
     "material_velocity",
+    "missed_pairs",
     "momentum",
     "play",
     "positive",

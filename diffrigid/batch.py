@@ -81,7 +81,8 @@ def _batch_sizes(tree) -> list[int]:
 def _chunk(world: World) -> int:
     """Power of two of worlds whose contacts and bodies fill LANES."""
     contacts = sum(len(pairs.a) * pairs.count for pairs in world.pairs)
-    return int(2 ** np.clip(np.round(np.log2(LANES / (contacts + 4 * len(world.names)))), 4, 12))
+    least = 0 if world.crowd else 4  # a crowd is wide enough by itself
+    return int(2 ** np.clip(np.round(np.log2(LANES / (contacts + 4 * len(world.names)))), least, 12))
 
 
 def _state_bytes(world: World, state: State) -> int:
