@@ -34,6 +34,7 @@ MANY = 256  # bodies from which this way is taken
 SHARE = 8  # bodies for each impact of a round
 ROUNDS = 4  # for each sweep
 ROUNDING = 64  # [-] of the last digit of the speeds: what closes no faster does not close
+SLOW = 1e-3  # [-] of `rest_speed`, likewise: else bodies that stick would take all rounds
 
 
 def is_many(kinds: Any, owners: Any, moving: int, alone: bool) -> bool:
@@ -80,7 +81,7 @@ def step_crowd(world: Any, state: State, dt: Array) -> State:
     """State of a crowd after dt (*batch) [s]."""
     crowd, start = _side_by_side(world, dt), _states(state, dt.shape)
     t0 = jnp.zeros_like(start.x[:, 0])
-    anchors = Anchors(state=start, t0=t0, since=t0 - crowd.dt)
+    anchors = Anchors(state=start, t0=t0, since=t0 - crowd.dt[None])
     end = _impacts(crowd, _walls(world, dt.shape), _near(world, crowd, start), anchors)
     end = state_at(launch(crowd.world, end.state, None, end.t0, crowd.dt), crowd.dt)
 
@@ -205,31 +206,34 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
 def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Next:
     """The impacts that are next for both their sides, as many as there is room for."""
     count, dt = len(near.count), lax.stop_gradient(crowd.dt)
-    speed, eps = norm(bodies.flight.v), jnp.finfo(dt.dtype).eps
+    speed, eps, rest_speed = norm(bodies.flight.v), jnp.finfo(dt.dtype).eps, crowd.world.contact.rest_speed
+    rest_speed, tie = lax.stop_gradient(rest_speed), jnp.sqrt(eps) * dt
     me = lax.broadcasted_iota(jnp.int32, (count,), 0)
 
-    def sooner(best: tuple[Array, Array], b: Side, number: Array, there: Any, speeds: Array) -> tuple[Array, Array]:
-        first, other = best
+    def sooner(best: tuple, b: Side, number: Array, there: Any, speeds: Array) -> tuple:
+        first, fastest, other = best
         s, _, found, u = approach(bodies, b, dt, None, True)
-        s = jnp.where(there & found & (s <= dt) & (u > ROUNDING * eps * speeds), s, jnp.inf)
-        # At the same time the lower number first, for both sides alike, so that some pair always agrees.
-        better = (s < first) | ((s == first) & (s < jnp.inf) & (number < other))
-        return jnp.where(better, s, first), jnp.where(better, number, other)
+        closes = u > jnp.maximum(ROUNDING * eps * speeds, SLOW * rest_speed)
+        s = jnp.where(there & found & (s <= dt) & closes, jnp.floor(s / tie), jnp.inf)
+        # At the same time the fastest first, then the lower number: alike for both sides, so that some pair agrees.
+        before = (u > fastest) | ((u == fastest) & (number < other))
+        better = (s < first) | ((s == first) & (s < jnp.inf) & before)
+        return tuple(jnp.where(better, new, old) for new, old in zip((s, u, number), best, strict=True))
 
-    def body(k: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+    def body(k: Array, best: tuple) -> tuple:
         number = lax.dynamic_index_in_dim(near.other, k, 0, keepdims=False)
         j = jnp.maximum(number, 0)
         return sooner(best, _at(bodies, j), number, number >= 0, speed + pick(speed, j))
 
-    def wall(best: tuple[Array, Array], one: Walls) -> tuple[tuple[Array, Array], None]:
+    def wall(best: tuple, one: Walls) -> tuple[tuple, None]:
         return sooner(best, one.side, one.number, True, speed), None
 
     most = jnp.minimum(near.count.max(), len(near.other))
-    best = jnp.full_like(speed, jnp.inf), jnp.zeros_like(me)
+    best = jnp.full_like(speed, jnp.inf), jnp.zeros_like(speed), jnp.zeros_like(me)
     best = lax.fori_loop(0, most, body, best)
     for some in walls:
         best, _ = lax.scan(wall, best, lax.stop_gradient(some))
-    first, other = best
+    first, _, other = best
     back = pick(other, jnp.minimum(other, count - 1))
     lead = (first < jnp.inf) & ((other >= count) | ((back == me) & (me < other)))
     ranks = jnp.cumsum(lead.astype(jnp.int32))
