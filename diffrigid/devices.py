@@ -18,7 +18,7 @@ SHARE = PartitionSpec("devices")
 
 def devices() -> list[jax.Device]:
     """The devices that share the work: all of the default platform, or the one that `jax.default_device` names."""
-    chosen = jax.config.jax_default_device
+    chosen = jax.config.jax_default_device  # type: ignore[attr-defined]
     return [chosen] if isinstance(chosen, jax.Device) else jax.devices(chosen)
 
 
@@ -32,8 +32,8 @@ def over_devices(fn: Callable, parts: Any, whole: Any) -> Any:
     if len(devices()) == 1:
         return fn(parts, whole)
     # Without the check of what varies from device to device, which does not know the loops and solves inside.
-    specs = {"in_specs": (SHARE, PartitionSpec()), "out_specs": SHARE}
-    return jax.shard_map(fn, mesh=_mesh(), **specs, check_vma=False)(parts, whole)
+    specs = (SHARE, PartitionSpec())
+    return jax.shard_map(fn, mesh=_mesh(), in_specs=specs, out_specs=SHARE, check_vma=False)(parts, whole)
 
 
 def everywhere(tree: Any) -> Any:
@@ -44,7 +44,7 @@ def everywhere(tree: Any) -> Any:
 
 
 def _mesh() -> Mesh:
-    return Mesh(np.array(devices()), SHARE)
+    return Mesh(np.array(devices()), ("devices",))
 
 
 def pieces_of(count: int, most: int) -> tuple[int, int]:

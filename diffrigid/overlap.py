@@ -103,8 +103,10 @@ def overlapping(colliders: dict[int, Placed], pairs: list, margin: float) -> lis
 
 
 def near_pairs(colliders: dict[int, Placed], moving: int) -> list[tuple[int, int]]:
-    """Pairs of which the first is below `moving` and that may overlap: of round colliders with all that is boundless, and
-    with each other where they are in the same cell of a grid, or in two that touch."""
+    """All pairs that may overlap: round ones in one cell of a grid, or in two that touch, and those with half-spaces.
+
+    The first of each is below `moving`.
+    """
     round_ones = {key: collider for key, collider in colliders.items() if collider.normal is None}
     pairs = [(i, j) for i in round_ones if i < moving for j in colliders if j not in round_ones]
     side = 2.0 * max((collider.size for collider in round_ones.values()), default=1.0)

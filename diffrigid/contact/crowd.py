@@ -82,8 +82,8 @@ def step_crowd(world: Any, state: State, dt: Array) -> State:
     crowd, start = _side_by_side(world, dt), _states(state, dt.shape)
     t0 = jnp.zeros_like(start.x[:, 0])
     anchors = Anchors(state=start, t0=t0, since=t0 - crowd.dt[None])
-    end = _impacts(crowd, _walls(world, dt.shape), _near(world, crowd, start), anchors)
-    end = state_at(launch(crowd.world, end.state, None, end.t0, crowd.dt), crowd.dt)
+    last = _impacts(crowd, _walls(world, dt.shape), _near(world, crowd, start), anchors)
+    end = state_at(launch(crowd.world, last.state, None, last.t0, crowd.dt), crowd.dt)
 
     def back(leaf: Array) -> Array:
         inner = leaf.shape[1:-1]
@@ -93,11 +93,11 @@ def step_crowd(world: Any, state: State, dt: Array) -> State:
 
 
 def missed_pairs(world: Any, state: State, dt: Any) -> Array:
-    """How many neighbours of the bodies of a crowd have no room in a step of dt [s] from `state`, (...). It should be 0.
+    """How many neighbours have no room in a step of dt [s] from `state`, (...), summed over the bodies: should be 0.
 
-    From 256 discs, or spheres, on, that no forces act on, and that meet only each other and half-spaces, pairs are found
-    by a grid, and each body has room for `Contact(neighbours=...)` others that it could touch within the step. More are
-    left out, and may be passed through: raise `neighbours`. In all other worlds every pair is tested.
+    In a crowd, 256 discs or spheres and more that no forces act on and that meet only each other and half-spaces,
+    pairs are found by a grid, and each body has room for `Contact(neighbours=...)` others that it could touch within
+    the step. More are left out, and may be passed through: raise `neighbours`. Elsewhere every pair is tested.
 
     Args:
         state: of one world, or with leading axes, as `rollout` and `rollout_batch` return it.
@@ -109,7 +109,7 @@ def missed_pairs(world: Any, state: State, dt: Any) -> Array:
 
     def one(state: State) -> Array:
         near = _near(world, crowd, _states(state, ()))
-        return jnp.maximum(near.count - len(near.other), 0).sum()
+        return jnp.maximum(near.found - len(near.other), 0).sum()
 
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(leading) :]), state)
     return lax.map(one, flat).reshape(leading)
@@ -119,7 +119,7 @@ def missed_pairs(world: Any, state: State, dt: Any) -> Array:
 
 
 def _columns(leaf: Array, bodies: bool, count: int, batch: tuple[int, ...]) -> Array:
-    """An array of `bodies` (N, ..., *batch) as (..., M); another (..., *batch) as (..., M), or (..., 1) if it can be."""
+    """An array of `bodies` (N, ..., *batch) as (..., M); another (..., *batch) as (..., M), or (..., 1) if alike."""
     inner, own = leaf.shape[: leaf.ndim - len(batch)], leaf.shape[leaf.ndim - len(batch) :]
     if not bodies:
         if max(own, default=1) == 1:
@@ -169,7 +169,9 @@ def _walls(world: Any, batch: tuple[int, ...]) -> list[Walls]:
             x, q = (rows(leaf, tuple(i - count for i in owner)) for leaf in (world.statics.x, world.statics.q))
             side, own = jax.tree.map(each, (Side(flight=None, shape=shape, x=x, q=q), materials(world, owner)))
             size = count * math.prod(batch)
-            walls.append(Walls(side=side, materials=own, number=jnp.array([size + i - count for i in owner], jnp.int32)))
+            walls.append(
+                Walls(side=side, materials=own, number=jnp.array([size + i - count for i in owner], jnp.int32))
+            )
     return walls
 
 
@@ -192,9 +194,7 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
         flight = jax.tree.map(lambda leaf: leaf[0], launch(crowd.world, anchors.state, None, anchors.t0, crowd.dt))
         bodies = Side(flight=flight, since=anchors.since[0], shape=crowd.shape)
         following = checkpoint_name(_next(crowd, walls, near, lax.stop_gradient(bodies)), FOUND)
-        after = lax.cond(
-            following.there[0], lambda a: _meet(crowd, walls, following, bodies, a), lambda a: a, anchors
-        )
+        after = lax.cond(following.there[0], lambda a: _meet(crowd, walls, following, bodies, a), lambda a: a, anchors)
         return after, following.there[0]
 
     def maybe(carry: tuple[Anchors, Array], _: None) -> tuple[tuple[Anchors, Array], None]:
@@ -205,7 +205,7 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
 
 def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Next:
     """The impacts that are next for both their sides, as many as there is room for."""
-    count, dt = len(near.count), lax.stop_gradient(crowd.dt)
+    count, dt = len(near.found), lax.stop_gradient(crowd.dt)
     speed, eps, rest_speed = norm(bodies.flight.v), jnp.finfo(dt.dtype).eps, crowd.world.contact.rest_speed
     rest_speed, tie = lax.stop_gradient(rest_speed), jnp.sqrt(eps) * dt
     me = lax.broadcasted_iota(jnp.int32, (count,), 0)
@@ -228,7 +228,7 @@ def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Next:
     def wall(best: tuple, one: Walls) -> tuple[tuple, None]:
         return sooner(best, one.side, one.number, True, speed), None
 
-    most = jnp.minimum(near.count.max(), len(near.other))
+    most = jnp.minimum(near.found.max(), len(near.other))
     best = jnp.full_like(speed, jnp.inf), jnp.zeros_like(speed), jnp.zeros_like(me)
     best = lax.fori_loop(0, most, body, best)
     for some in walls:
@@ -279,7 +279,8 @@ def _blow(crowd: Crowd, a: Array, side_a: Side, own: list, side_b: Side, others:
     world, dt = _at((crowd.world, crowd.dt), a)
     strike = strikes_of(world, side_a, side_b, jnp.broadcast_to(dt, a.shape), jnp.asarray(False), None)
     on = strike.active & there[None]
-    e, mu = law(*jax.tree.map(lambda leaf: leaf[None], (own, others)), strike)
+    own, others = jax.tree.map(lambda leaf: leaf[None], (own, others))
+    e, mu = law(own, others, strike)
     u = -jax.vmap(dot)(strike.normal, strike.v_rel)
     target = jnp.where(u <= world.contact.rest_speed[None], 0.0, e * u)
     P = impulses(on, strike.K, strike.normal, strike.v_rel, target, mu)

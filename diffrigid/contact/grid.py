@@ -19,7 +19,7 @@ class Near(NamedTuple):
     """Who is near each of M bodies, on both sides of a pair."""
 
     other: Array  # (E, M) int, numbers of bodies; -1: none. The first of all that there are, if there are more
-    count: Array  # (M,) int, how many there are
+    found: Array  # (M,) int, how many there are
 
 
 def neighbours(x: Array, reach: Array, worlds: int, most: int) -> Near:
@@ -76,7 +76,7 @@ def _stretches(x: Array, reach: Array, worlds: int) -> tuple[Array, list[Array],
 
 
 def _in_order(cell: Array, cells: int) -> Array:
-    """Bodies by their cells. Cell and body in one number, where it is not too large, are sorted in a sixth of the time."""
+    """Bodies by their cells. Cell and body in one number, if it is not too large, are sorted in a sixth of the time."""
     count = len(cell)
     if cells * count >= 2**31:
         return jnp.argsort(cell)
