@@ -5,7 +5,7 @@ S statics, C contacts, P pairs, K contacts of a pair, T time steps; trailing bat
 """
 
 from diffrigid.batch import rollout_batch
-from diffrigid.contact import Contact, missed_pairs
+from diffrigid.contact import Contact
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.models import load_mjcf, load_urdf
@@ -21,7 +21,7 @@ from diffrigid.state import (
     material_velocity,
     momentum,
 )
-from diffrigid.step import Trajectory, rollout, step
+from diffrigid.step import Trajectory, missed_pairs, rollout, step
 from diffrigid.sysid import (
     Channel,
     Fit,

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.contact.crowd import without_room
 from diffrigid.convert import largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import with_tangents
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.state import State
-from diffrigid.world import World, check
+from diffrigid.world import World, check, check_kinds
 
 MEMORY = 2**31  # [bytes] of states that reverse mode saves before it rather computes steps again
 
@@ -92,6 +93,28 @@ def rollout(
         raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
     counts = _substeps(t, longest) if substeps is None else _given_substeps(substeps, t.shape[0] - 1)
     return Trajectory(t=t, state=_rollout_jit(world, state, jnp.diff(t), controls, counts, memory), world=world)
+
+
+def missed_pairs(world: World, state: State, dt: Any) -> Array:
+    """How many neighbours have no room in a step of dt [s] from `state`, (...), summed over the bodies: should be 0.
+
+    In a crowd, 256 discs or spheres and more that no forces act on and that meet only each other and half-spaces,
+    pairs are found by a grid, and each body has room for `Contact(neighbours=...)` others that it could touch within
+    the step. More are left out, and may be passed through: raise `neighbours`. Elsewhere every pair is tested.
+
+    Args:
+        state: of one world, or with leading axes, as `rollout` and `rollout_batch` return it.
+
+    Raises:
+        ValueError: not a world and a state; dt <= 0.
+    """
+    check_kinds(world, state)
+    world, state = floats(world, state)
+    length, leading = step_length(dt, state), state.x.shape[:-2]
+    if not world.crowd:
+        return jnp.zeros(leading, jnp.int32)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(leading) :]), state)
+    return lax.map(lambda state: without_room(world, state, length), flat).reshape(leading)
 
 
 def floats(world: World, state: State) -> tuple[World, State]:

@@ -84,6 +84,8 @@ def check_kinds(world: Any, state: Any) -> None:
         )
     if world.crowd and not traced(world.contact.width) and np.any(np.asarray(world.contact.width) > 0):
         raise ValueError(f"contact.width is {world.contact.width}: expected 0 for so many bodies; use fewer than 256.")
+    if world.crowd and (world.forces or world.joints):
+        raise ValueError("world has forces or joints, but was made as a crowd without: give them to `scene`.")
     if not isinstance(world.bodies, Bodies):
         raise ValueError(f"world.bodies is a {type(world.bodies).__name__}: expected the Bodies that `scene` made.")
 

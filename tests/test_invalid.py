@@ -254,6 +254,8 @@ RUNS = {
     "batch chunk": (lambda v: dr.rollout_batch(*many(), dt=0.1, steps=1, chunk=v), tuple(v for v in INTEGER if v is not None and v is not HUGE)),
     "rollout memory": (lambda v: roll(steps=1, memory=v), tuple(v for v in INTEGER if v is not HUGE)),
     "batch memory": (lambda v: dr.rollout_batch(*many(), dt=0.1, steps=1, memory=v), tuple(v for v in INTEGER if v is not HUGE)),
+    "missed_pairs world": (lambda v: dr.missed_pairs(v, pair()[1], 0.1), (*RECORD, None, pair)),
+    "missed_pairs dt": (lambda v: dr.missed_pairs(*pair(), v), (*POSITIVE, None)),
     "play": (dr.play, (*RECORD, None, {"a": 1.0}, {})),
 }  # fmt: skip
 FITS = {

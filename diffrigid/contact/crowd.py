@@ -92,27 +92,10 @@ def step_crowd(world: Any, state: State, dt: Array) -> State:
     return jax.tree.map(back, end)
 
 
-def missed_pairs(world: Any, state: State, dt: Any) -> Array:
-    """How many neighbours have no room in a step of dt [s] from `state`, (...), summed over the bodies: should be 0.
-
-    In a crowd, 256 discs or spheres and more that no forces act on and that meet only each other and half-spaces,
-    pairs are found by a grid, and each body has room for `Contact(neighbours=...)` others that it could touch within
-    the step. More are left out, and may be passed through: raise `neighbours`. Elsewhere every pair is tested.
-
-    Args:
-        state: of one world, or with leading axes, as `rollout` and `rollout_batch` return it.
-    """
-    leading = state.x.shape[:-2]
-    if not world.crowd:
-        return jnp.zeros(leading, jnp.int32)
-    crowd = _side_by_side(world, jnp.asarray(dt, state.x.dtype))
-
-    def one(state: State) -> Array:
-        near = _near(world, crowd, _states(state, ()))
-        return jnp.maximum(near.found - len(near.other), 0).sum()
-
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(leading) :]), state)
-    return lax.map(one, flat).reshape(leading)
+def without_room(world: Any, state: State, dt: Array) -> Array:
+    """How many neighbours of the bodies of one crowd there is no room for in a step of dt () [s], ()."""
+    near = _near(world, _side_by_side(world, dt), _states(state, ()))
+    return jnp.maximum(near.found - len(near.other), 0).sum()
 
 
 # ---- the bodies of all worlds side by side
