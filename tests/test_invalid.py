@@ -152,6 +152,7 @@ SCENES = {
     "width": (lambda v: flat(options={"contact": dr.Contact(width=v)}), (*NOT_NEGATIVE, None)),
     "rest_speed": (lambda v: flat(options={"contact": dr.Contact(rest_speed=v)}), (*NOT_NEGATIVE, None)),
     "sweeps": (lambda v: flat(options={"contact": dr.Contact(sweeps=v)}), INTEGER),
+    "neighbours": (lambda v: flat(options={"contact": dr.Contact(neighbours=v)}), INTEGER),
 }  # fmt: skip
 FORCES = {
     "Drag.linear": (lambda v: forced(dr.Drag(linear=v)), (*ODD, None, np.inf, (1.0, 2.0, 3.0), (np.nan, 0.0))),
