@@ -141,7 +141,7 @@ def gas(count):
     side = 0.5 * across
 
     def scene(world):
-        def check(x, v):  # no two overlap by 1 cm, of those in the same cell or in two that touch; energy only falls
+        def check(x, v):  # no overlap by 3 cm, of those in one cell or in two that touch; energy only falls
             cells = defaultdict(list)
             for point in x:
                 cells[int(point[0] / 0.25), int(point[1] / 0.25)].append(point)
@@ -155,7 +155,7 @@ def gas(count):
             overlap = max(0.0, *(0.2 - math.dist(a, b) for a, b in near))
             out = max(0.0, *(abs(s - side / 2) - side / 2 + 0.1 for point in x for s in point))
             energy = sum(vx**2 + vy**2 for vx, vy in v) / (count * 2.0**2)
-            ok = max(overlap, out) < 0.01 and 0.3 < energy < 1.0
+            ok = max(overlap, out) < 0.03 and 0.3 < energy < 1.0
             return {"energy_ratio": round(energy, 3), "overlap": round(overlap, 4), "out": round(out, 4), "ok": ok}
 
         angles = [2.399963 * i + 0.1 * world for i in range(count)]

@@ -45,9 +45,9 @@ def is_many(kinds: Any, owners: Any, moving: int, alone: bool) -> bool:
         owners: for each entry, the collider of each of its rows.
         alone: nothing else acts on them: no forces, joints, friction against rolling, and none pass through others.
     """
-    movers = [kind for kind, of in zip(kinds, owners, strict=True) for owner in of if owner < moving]
-    solved = set(kinds) <= {HalfSpace, Disc, Sphere} and len(set(movers)) == 1 and len(movers) == moving
-    return moving >= MANY and alone and solved
+    entries = [entry for entry, of in enumerate(owners) for owner in of if owner < moving]
+    one_each = len(entries) == moving and len(set(entries)) == 1
+    return moving >= MANY and alone and one_each and set(kinds) <= {HalfSpace, Disc, Sphere}
 
 
 @pytree
