@@ -6,7 +6,8 @@ Scene S2 of `throughput.py` (sixteen discs in a box), 2048 worlds, 60 steps, sin
 `rollout_batch` that is the same in all cases: on 1 device, on N devices of one process, on N processes of one device
 each (pinned to a core each, as launchers do); forward and gradient, median of five after a warm-up.
 
-2026-11-22, two cores of an AMD EPYC (Zen 5): RESULT
+2026-11-22, two cores of an AMD EPYC (Zen 5) that others used too, so that no ratio could be taken: forward, two devices
+did 1.7e6 world-steps per CPU-second, one 1.1e6 to 1.4e6. The cache: 29 CPU-seconds to the first result, then 7.
 """
 
 import argparse
