@@ -21,7 +21,7 @@ from diffrigid.state import (
     material_velocity,
     momentum,
 )
-from diffrigid.step import Trajectory, rollout, step
+from diffrigid.step import Trajectory, missed_pairs, rollout, step
 from diffrigid.sysid import (
     Channel,
     Fit,
@@ -100,6 +100,7 @@ __all__ = [
     "load_urdf",
     "material_point",
     "material_velocity",
+    "missed_pairs",
     "momentum",
     "play",
     "positive",

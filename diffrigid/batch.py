@@ -1,9 +1,9 @@
 """Many worlds at once: the one place where the batch axis moves.
 
 Inside, the batch is the last axis, because on a CPU XLA vectorises the innermost one, and a batch runs in
-chunks whose temporaries stay in the cache. Outside, the JAX convention holds: a leading batch axis. Plain
-`jax.vmap(rollout)` gives the same numbers, but slower than one after the other where bodies meet: a branch under it
-computes both ways.
+chunks whose temporaries stay in the cache, divided among the devices. Outside, the JAX convention holds: a leading
+batch axis. Plain `jax.vmap(rollout)` gives the same numbers, but slower than one after the other where bodies meet: a
+branch under it computes both ways.
 """
 
 from typing import Any
@@ -11,29 +11,38 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import lax
 
+from diffrigid.devices import cut, devices, join, over_devices, pieces_of
 from diffrigid.pytree import map_arrays
+from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State
-from diffrigid.step import aligned, at_least_one, final_state, floats, scan_steps, step_length
+from diffrigid.step import MEMORY, aligned, at_least_one, final_state, floats, scan_steps, step_length
 from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
 LANES = 2**15
+CORNER = 32  # lanes of a contact of shapes with corners: it is searched for, and is rarely alone
 
 
 def rollout_batch(
-    world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, chunk: int | None = None
-) -> State:
+    world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, chunk: int | None = None,
+    memory: int = MEMORY,
+) -> State:  # fmt: skip
     """States of B worlds, from `world` and `state` of which any leaf may have a leading batch axis.
 
     Args:
         dt: [s].
         steps: T >= 1.
         final_only: return only the last state, (B, N, ...); else all of them, (B, T+1, N, ...).
-        chunk: worlds that run together; default: as many as fit the cache.
+        chunk: worlds that run together; default: as many as fit the cache and `memory`.
+        memory: [bytes] that reverse mode may save on each device. A batch that would need more saves the starts of its
+            chunks, and computes each again; one that still would, the states at every so many steps, as `rollout` does.
+
+    All devices that JAX has share the work, those of other processes too: then every process makes the same call,
+    and the result lies where it was computed (`jax.experimental.multihost_utils.process_allgather` brings it together).
 
     Raises:
-        ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps < 1.
+        ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps < 1; memory < 1.
 
     Example:
         >>> thrown = dr.replace(state, v=jnp.array([[[0.0, 0.0]], [[1.0, 0.0]], [[2.0, 0.0]]]))  # (B, N, D)
@@ -46,10 +55,12 @@ def rollout_batch(
     sizes = {size for tree in (world, state) for size in _batch_sizes(tree)}
     if len(sizes) != 1:
         raise ValueError(f"rollout_batch: expected one leading batch axis on some leaf, got lengths {sorted(sizes)}")
-    length, steps = step_length(dt, state), at_least_one("steps", steps)
-    count = sizes.pop()
-    chunk = min(_chunk(world) if chunk is None else at_least_one("chunk", chunk), count)
-    return _run(world, state, length, steps, final_only, count, chunk)
+    length, steps, memory = step_length(dt, state), at_least_one("steps", steps), at_least_one("memory", memory)
+    count, most = sizes.pop(), _chunk(world) if chunk is None else at_least_one("chunk", chunk)
+    if chunk is None:
+        least = 2 * int(np.sqrt(steps)) * _state_bytes(world, state)  # of one world, saved at every so many steps
+        most = max(min(most, memory // least), 1)
+    return _run(world, state, length, steps, final_only, count, pieces_of(count, most), memory)
 
 
 def _check_leaves(world: World, state: State) -> None:
@@ -77,36 +88,41 @@ def _batch_sizes(tree) -> list[int]:
 
 def _chunk(world: World) -> int:
     """Power of two of worlds whose contacts and bodies fill LANES."""
-    contacts = sum(len(pairs.a) * pairs.count for pairs in world.pairs)
-    return int(2 ** np.clip(np.round(np.log2(LANES / (contacts + 4 * len(world.names)))), 4, 12))
+
+    def lanes(pairs):
+        rounds = all(
+            isinstance(world.shapes[kind], Disc | Sphere | HalfSpace) for kind in (pairs.shape_a, pairs.shape_b)
+        )
+        return len(pairs.a) * pairs.count * (1 if rounds else CORNER)
+
+    contacts = sum(map(lanes, world.pairs))
+    least = 0 if world.crowd else 4  # a crowd is wide enough by itself
+    return int(2 ** np.clip(np.round(np.log2(LANES / (contacts + 4 * len(world.names)))), least, 12))
 
 
-@jax.jit(static_argnames=("steps", "final_only", "count", "chunk"))
-def _run(world, state, dt, steps, final_only, count, chunk):
-    pieces = -(-count // chunk)
+def _state_bytes(world: World, state: State) -> int:
+    sizes = axis_sizes(world)
+    return sizes["N"] * (2 * sizes["D"] + sizes["Q"] + sizes["A"]) * state.x.dtype.itemsize
+
+
+@jax.jit(static_argnames=("steps", "final_only", "count", "pieces", "memory"))
+def _run(world, state, dt, steps, final_only, count, pieces, memory):
     leaves, tree = jax.tree.flatten((world, state))
     batched = jax.tree.leaves(map_arrays(lambda leaf, letters, _: leaf.ndim > len(letters), (world, state)))
-    split = [_split(leaf, pieces, chunk) for leaf, many in zip(leaves, batched, strict=True) if many]
+    split = [cut(leaf, 0, *pieces) for leaf, many in zip(leaves, batched, strict=True) if many]
+    alike = [leaf for leaf, many in zip(leaves, batched, strict=True) if not many]
 
-    def one_chunk(pieces_of):
-        rest = iter(pieces_of)
-        filled = [next(rest) if many else leaf for leaf, many in zip(leaves, batched, strict=True)]
-        world, state = aligned(*jax.tree.unflatten(tree, filled))
+    def one_chunk(own, alike, dt):
+        own, alike = iter(own), iter(alike)
+        world, state = aligned(*jax.tree.unflatten(tree, [next(own if many else alike) for many in batched]))
         if final_only:
-            return final_state(world, state, dt, steps)
-        return scan_steps(world, state, jnp.full((steps,), dt), None, (1,) * steps)
+            return final_state(world, state, dt, steps, memory)
+        return scan_steps(world, state, jnp.full((steps,), dt), None, (1,) * steps, memory)
 
-    return jax.tree.map(lambda leaf: _join(leaf, count), lax.map(one_chunk, split))
+    if _state_bytes(world, state) * steps * pieces[0] * pieces[1] > memory * len(devices()):
+        one_chunk = jax.checkpoint(one_chunk)
 
+    def chunks(parts, whole):
+        return lax.map(lambda own: one_chunk(own, *whole), parts)
 
-def _split(leaf: Array, pieces: int, chunk: int) -> Array:
-    """(B, ...) to (pieces, ..., chunk), the last piece filled up with copies of the last world."""
-    short = pieces * chunk - leaf.shape[0]
-    leaf = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], short, axis=0)]) if short else leaf
-    return jnp.moveaxis(leaf.reshape(pieces, chunk, *leaf.shape[1:]), 1, -1)
-
-
-def _join(leaf: Array, count: int) -> Array:
-    """(pieces, ..., chunk) to (B, ...)."""
-    leaf = jnp.moveaxis(leaf, -1, 1)
-    return leaf.reshape(-1, *leaf.shape[2:])[:count]
+    return jax.tree.map(lambda leaf: join(leaf, 0, count), over_devices(chunks, split, (alike, dt)))

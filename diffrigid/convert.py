@@ -129,6 +129,8 @@ def materials(colliders: Mapping[str, Any], general: Mapping[str, Any]) -> dict[
             rest = check(field, 0.0 if default is None else default)
             values = [rest if value is None else check(f"{name}.{field}", value) for name, value in own.items()]
             found[field] = stack(values), given
+        elif field in ("restitution", "friction"):
+            raise ValueError(f"{field} is None: expected a number; 0 is none.")
     return found
 
 

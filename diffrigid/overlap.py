@@ -5,6 +5,7 @@ one of finitely many: normals of faces, perpendiculars of two edges or of an edg
 two vertices (separating axes). For cores that overlap it is minus the least translation that parts them.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -99,3 +100,21 @@ def overlapping(colliders: dict[int, Placed], pairs: list, margin: float) -> lis
             if separation(colliders[i], colliders[j]) < -margin * min(size[i], size[j]):
                 deep.append((i, j))
     return deep
+
+
+def near_pairs(colliders: dict[int, Placed], moving: int) -> list[tuple[int, int]]:
+    """All pairs that may overlap: round ones in one cell of a grid, or in two that touch, and those with half-spaces.
+
+    The first of each is below `moving`.
+    """
+    round_ones = {key: collider for key, collider in colliders.items() if collider.normal is None}
+    pairs = [(i, j) for i in round_ones if i < moving for j in colliders if j not in round_ones]
+    side = 2.0 * max((collider.size for collider in round_ones.values()), default=1.0)
+    cells: dict[tuple, list[int]] = {}
+    for key, collider in round_ones.items():
+        cells.setdefault(tuple(np.floor(collider.corners[0] / side).astype(int).tolist()), []).append(key)
+    for cell, keys in cells.items():
+        around = itertools.product(*((k - 1, k, k + 1) for k in cell))
+        others = [key for there in around for key in cells.get(there, [])]
+        pairs += [(i, j) for i in keys for j in others if i < j and i < moving]
+    return pairs

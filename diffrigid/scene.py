@@ -11,6 +11,7 @@ import numpy as np
 
 from diffrigid.collide import COLLIDERS, pair_groups
 from diffrigid.contact import Contact
+from diffrigid.contact.crowd import is_many
 from diffrigid.convert import (
     Solid,
     angular_velocity,
@@ -27,7 +28,7 @@ from diffrigid.convert import (
 )
 from diffrigid.forces import Gravity
 from diffrigid.joint_checks import joints_of, warn_of_torn_joints
-from diffrigid.overlap import overlapping, place
+from diffrigid.overlap import near_pairs, overlapping, place
 from diffrigid.pytree import map_arrays, refuse_missing
 from diffrigid.shape_checks import check_shape
 from diffrigid.shapes import BOUNDLESS, Hull, Polygon, Profile, Shape, dimension, traced
@@ -35,6 +36,7 @@ from diffrigid.state import COEFFICIENTS, Bodies, State
 from diffrigid.world import Offset, Statics, World
 
 OVERLAP = 1e-4  # [-] of the smaller size: penetration at the start that is worth a warning
+TURNING = {"rolling_friction", "spinning_friction"}
 RESERVED = (*COEFFICIENTS, "contact")  # paths, or the first part of one; and "gravity"
 
 
@@ -150,17 +152,20 @@ def scene(
     solids = {name: solid_of(shapes[name], dim) for name in moving}
     records, offsets, owners = _stack_shapes(shapes, solids, dim)
     kinds = [type(record) for record in records]
-    pairs = pair_groups(kinds, owners, n, passing, COLLIDERS, lambda i, j: _count(records[i], records[j], dim))
     numbers_of_all = restitution, friction, restitution_falloff, rolling_friction, spinning_friction
     material = materials(everything, dict(zip(COEFFICIENTS, numbers_of_all, strict=True)))
     if dim == 2 and "spinning_friction" in material:
         raise ValueError("spinning_friction: in 2D nothing turns about a normal; give rolling_friction.")
+    crowd = is_many(kinds, owners, n, not (named_forces or linked or passing or {*material} & TURNING))
+    pairs: tuple = ()
+    if not crowd:
+        pairs = pair_groups(kinds, owners, n, passing, COLLIDERS, lambda i, j: _count(records[i], records[j], dim))
     of_bodies, of_statics = ({k: c[part] for k, (c, _) in material.items()} for part in (slice(n), slice(n, None)))
     mass, inertia = zip(*(mass_and_inertia(k, b, solids[k], dim) for k, b in moving.items()), strict=True)
     made = World(
         bodies=Bodies(mass=stack(mass), inertia=stack(inertia), dim=dim, **of_bodies),
         statics=Statics(**_poses(still, dim), **of_statics),
-        shapes=records, offsets=offsets, owners=owners, pairs=pairs,
+        shapes=records, offsets=offsets, owners=owners, pairs=pairs, crowd=crowd,
         forces=tuple(named_forces.values()), force_names=tuple(named_forces),
         joints=linked, joint_names=joint_names,
         contact=_contact(Contact() if contact is None else contact),
@@ -296,8 +301,10 @@ def _contact(contact: Any) -> Contact:
     if not isinstance(contact, Contact):
         raise ValueError(f"contact is {contact!r}: expected a Contact(width=0.0).")
     refuse_missing(contact, "contact")
-    if not isinstance(contact.sweeps, int) or isinstance(contact.sweeps, bool) or contact.sweeps < 1:
-        raise ValueError(f"contact.sweeps is {contact.sweeps!r}: expected an integer above 0; leave it out.")
+    for name in ("sweeps", "neighbours"):
+        value = getattr(contact, name)
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"contact.{name} is {value!r}: expected an integer above 0; leave it out.")
 
     def check(leaf, letters, path):
         del letters
@@ -319,6 +326,8 @@ def _warn_of_overlap(world: World, state: State, shapes: Mapping, solids: Mappin
         if shape is not None and not isinstance(shape, Profile) and not traced((shape, center, x, q)):
             placed[index] = place(shape, x, q, center)
     pairs = [pair for group in world.pairs for pair in zip(group.a, group.b, strict=True)]
+    if world.crowd:
+        pairs = near_pairs(placed, len(world.names))
     if deep := overlapping(placed, pairs, OVERLAP):
         names = list(shapes)
         text = ", ".join(f"{names[i]} and {names[j]}" for i, j in sorted(deep))

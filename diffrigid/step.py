@@ -10,15 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.contact.crowd import without_room
 from diffrigid.convert import largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import with_tangents
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.state import State
-from diffrigid.world import World, check
+from diffrigid.world import World, check, check_kinds
 
-BLOCK_BYTES = 2**26  # saved states of a reverse pass beyond which a rollout is checkpointed in blocks
+MEMORY = 2**31  # [bytes] of states that reverse mode saves before it rather computes steps again
 
 
 @pytree
@@ -68,7 +69,7 @@ def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
 
 def rollout(
     world: World, state: State, *, dt: Any, steps: int | None = None, times: Any = None,
-    substeps: tuple[int, ...] | None = None, controls: Any = None,
+    substeps: tuple[int, ...] | None = None, controls: Any = None, memory: int = MEMORY,
 ) -> Trajectory:  # fmt: skip
     """Trajectory from `state`, at every step or at given times.
 
@@ -79,12 +80,13 @@ def rollout(
             no longer than dt. Differentiable. Inside jit or vmap, give `substeps`, the number of steps of each
             interval, because it has to be known when tracing.
         controls: pytree of arrays with a leading axis of T: what forces with a `control` add, by interval.
+        memory: [bytes] of states that reverse mode may save. If those of all steps do not fit, it saves one after every
+            square root of their number, which is the least that it can do with, and computes each step once more.
 
     Raises:
-        ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing.
+        ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing; memory < 1.
 
-    Both modes of differentiation work. Reverse mode saves only states, and on long rollouts only every so
-    many, and computes steps again.
+    Both modes of differentiation work.
 
     Example:
         >>> trajectory = dr.rollout(world, state, dt=1 / 60, steps=30)
@@ -95,17 +97,39 @@ def rollout(
     if (steps is None) == (times is None):
         raise ValueError(f"rollout: give either steps or times, got {'neither' if steps is None else 'both'}")
     world, state = floats(world, state)
-    longest = step_length(dt, state)
+    longest, memory = step_length(dt, state), at_least_one("memory", memory)
     if times is None:
         count = at_least_one("steps", steps)
         t = longest * jnp.arange(count + 1, dtype=longest.dtype)
-        states = _rollout_jit(world, state, jnp.broadcast_to(longest, (count,)), controls, (1,) * count)
+        states = _rollout_jit(world, state, jnp.broadcast_to(longest, (count,)), controls, (1,) * count, memory)
         return Trajectory(t=t, state=states, world=world)
     t = jnp.asarray(numbers("times", times, None), state.x.dtype)
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
     counts = _substeps(t, longest) if substeps is None else _given_substeps(substeps, t.shape[0] - 1)
-    return Trajectory(t=t, state=_rollout_jit(world, state, jnp.diff(t), controls, counts), world=world)
+    return Trajectory(t=t, state=_rollout_jit(world, state, jnp.diff(t), controls, counts, memory), world=world)
+
+
+def missed_pairs(world: World, state: State, dt: Any) -> Array:
+    """How many neighbours have no room in a step of dt [s] from `state`, (...), summed over the bodies: should be 0.
+
+    In a crowd, 256 discs or spheres and more that no forces act on and that meet only each other and half-spaces,
+    pairs are found by a grid, and each body has room for `Contact(neighbours=...)` others that it could touch within
+    the step. More are left out, and may be passed through: raise `neighbours`. Elsewhere every pair is tested.
+
+    Args:
+        state: of one world, or with leading axes, as `rollout` and `rollout_batch` return it.
+
+    Raises:
+        ValueError: not a world and a state; dt <= 0.
+    """
+    check_kinds(world, state)
+    world, state = floats(world, state)
+    length, leading = step_length(dt, state), state.x.shape[:-2]
+    if not world.crowd:
+        return jnp.zeros(leading, jnp.int32)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(leading) :]), state)
+    return lax.map(lambda state: without_room(world, state, length), flat).reshape(leading)
 
 
 def floats(world: World, state: State) -> tuple[World, State]:
@@ -126,7 +150,7 @@ def step_length(dt: Any, state: State, batch: bool = False) -> Array:
 
 
 def at_least_one(name: str, count: Any) -> int:
-    """A number of steps, or of worlds."""
+    """A number of steps, of worlds, or of bytes."""
     if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
         raise ValueError(f"{name} is {count!r}, expected an integer >= 1")
     return int(count)
@@ -188,12 +212,14 @@ def _step_jit(world, state, dt, controls):
     return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
 
 
-@jax.jit(static_argnames=("counts",))
-def _rollout_jit(world, state, intervals, controls, counts):
-    return scan_steps(*aligned(world, state), intervals, controls, counts)
+@jax.jit(static_argnames=("counts", "memory"))
+def _rollout_jit(world, state, intervals, controls, counts, memory):
+    return scan_steps(*aligned(world, state), intervals, controls, counts, memory)
 
 
-def scan_steps(world: World, state: State, intervals: Array, controls: Any, counts: tuple[int, ...]) -> State:
+def scan_steps(
+    world: World, state: State, intervals: Array, controls: Any, counts: tuple[int, ...], memory: int = MEMORY
+) -> State:
     """States at the ends of intervals (T, *batch) [s], after `state` itself; interval k takes counts[k] equal steps."""
     owner = np.repeat(np.arange(len(counts)), counts)
     lengths = intervals[owner] / np.array(counts, intervals.dtype)[owner].reshape(-1, *[1] * (intervals.ndim - 1))
@@ -204,7 +230,7 @@ def scan_steps(world: World, state: State, intervals: Array, controls: Any, coun
         state = one_step(state, *inputs)
         return state, state
 
-    block, start = _block_length(state, len(owner)), with_tangents(state, (world, intervals, controls))
+    block, start = _block_length(state, len(owner), memory), with_tangents(state, (world, intervals, controls))
     _, states = _blocked_scan(record, start, (lengths, controls), len(owner), block)
     ends = np.cumsum(counts) - 1
     if len(owner) != len(counts):
@@ -212,7 +238,7 @@ def scan_steps(world: World, state: State, intervals: Array, controls: Any, coun
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, states)
 
 
-def final_state(world: World, state: State, dt: Array, steps: int) -> State:
+def final_state(world: World, state: State, dt: Array, steps: int, memory: int) -> State:
     """State after `steps` steps of dt (), without the ones between."""
     one_step = fenced(world)
 
@@ -220,7 +246,7 @@ def final_state(world: World, state: State, dt: Array, steps: int) -> State:
         return one_step(state, dt, None), None
 
     state = with_tangents(state, (world, dt))
-    return _blocked_scan(record, state, jnp.full((steps,), dt), steps, _block_length(state, steps))[0]
+    return _blocked_scan(record, state, jnp.full((steps,), dt), steps, _block_length(state, steps, memory))[0]
 
 
 def fenced(world: World):
@@ -241,10 +267,10 @@ def fenced(world: World):
     return jax.checkpoint(one_step, prevent_cse=False)
 
 
-def _block_length(state: State, steps: int) -> int:
-    """Steps between saved states: 1 while all fit into BLOCK_BYTES, else about the square root of the steps."""
+def _block_length(state: State, steps: int, memory: int) -> int:
+    """Steps between saved states: 1 while all fit into `memory` [bytes], else about the square root of the steps."""
     saved = steps * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-    return 1 if saved <= BLOCK_BYTES else int(np.sqrt(steps))
+    return 1 if saved <= memory else int(np.sqrt(steps))
 
 
 def _blocked_scan(record, state, inputs, steps: int, block: int):

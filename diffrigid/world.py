@@ -9,6 +9,7 @@ from jax import Array
 from diffrigid.collide import PairGroup
 from diffrigid.contact import Contact
 from diffrigid.pytree import array, map_arrays, pytree, refuse_missing, stacked, static
+from diffrigid.shapes import traced
 from diffrigid.state import Bodies, State
 
 
@@ -52,6 +53,7 @@ class World:
     joint_names: tuple[tuple[str, ...], ...] = static()  # of the rows of each record of `joints`
     owners: tuple[tuple[int, ...], ...] = static()
     pairs: tuple[PairGroup, ...] = static()
+    crowd: bool = static(default=False)  # so many bodies that pairs are not listed, but found in every step
     own_restitution: tuple[bool, ...] = static()  # of each collider: given to it, not the scene's default
     own_friction: tuple[bool, ...] = static()
     own_restitution_falloff: tuple[bool, ...] = static(default=())
@@ -85,6 +87,10 @@ def check_kinds(world: Any, state: Any) -> None:
             f"expected (world, state), got ({type(world).__name__}, {type(state).__name__}): "
             "both come from `diffrigid.scene`, in this order."
         )
+    if world.crowd and not traced(world.contact.width) and np.any(np.asarray(world.contact.width) > 0):
+        raise ValueError(f"contact.width is {world.contact.width}: expected 0 for so many bodies; use fewer than 256.")
+    if world.crowd and (world.forces or world.joints):
+        raise ValueError("world has forces or joints, but was made as a crowd without: give them to `scene`.")
     if not isinstance(world.bodies, Bodies):
         raise ValueError(f"world.bodies is a {type(world.bodies).__name__}: expected the Bodies that `scene` made.")
 

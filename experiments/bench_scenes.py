@@ -7,7 +7,7 @@ batches that diffrigid is measured with.
 
 import itertools
 import math
-from collections import namedtuple
+from collections import defaultdict, namedtuple
 
 # Bodies of one shape, (radius,) of discs or the half sizes of boxes, N pairs or triples x, v and w, between walls
 # (normal, offset) that keep normal . x >= offset. chain: each is joined to the one before, the first to the origin.
@@ -135,7 +135,56 @@ def pendulum(world):
     )
 
 
+def gas(count):
+    """As many discs, square, between walls in the same proportion: S6 of 64, 256, 1024 and 4096."""
+    across = math.isqrt(count)
+    side = 0.5 * across
+
+    def scene(world):
+        def check(x, v):  # no overlap by 3 cm, of those in one cell or in two that touch; energy only falls
+            cells = defaultdict(list)
+            for point in x:
+                cells[int(point[0] / 0.25), int(point[1] / 0.25)].append(point)
+            near = (
+                (a, b)
+                for (i, j), here in cells.items()
+                for di, dj in itertools.product((-1, 0, 1), repeat=2)
+                for a, b in itertools.product(here, cells.get((i + di, j + dj), ()))
+                if a != b
+            )
+            overlap = max(0.0, *(0.2 - math.dist(a, b) for a, b in near))
+            out = max(0.0, *(abs(s - side / 2) - side / 2 + 0.1 for point in x for s in point))
+            energy = sum(vx**2 + vy**2 for vx, vy in v) / (count * 2.0**2)
+            ok = max(overlap, out) < 0.03 and 0.3 < energy < 1.0
+            return {"energy_ratio": round(energy, 3), "overlap": round(overlap, 4), "out": round(out, 4), "ok": ok}
+
+        angles = [2.399963 * i + 0.1 * world for i in range(count)]
+        return Scene(
+            peers=FLAT,
+            worlds=(1,),
+            dt=1 / 240,
+            steps=240,
+            size=(0.1,),
+            mass=1.0,
+            friction=0.0,
+            restitution=0.9,
+            gravity=0.0,
+            walls=(((1.0, 0.0), 0.0), ((-1.0, 0.0), -side), ((0.0, 1.0), 0.0), ((0.0, -1.0), -side)),
+            x=[(0.25 + 0.5 * (i % across), 0.25 + 0.5 * (i // across)) for i in range(count)],
+            v=[(2 * math.cos(a), 2 * math.sin(a)) for a in angles],
+            check=check,
+        )
+
+    return scene
+
+
 SCENES = {"S1": bounce, "S2": billiards, "S3": boxes, "S4": cube_toss, "S5": pendulum}
+SCENES |= {f"S6_{count}": gas(count) for count in (64, 256, 1024, 4096)}
+
+
+def half_length(scene):
+    """Of the bars that stand for walls [m]."""
+    return max([10.0, *(abs(1.1 * offset) for _, offset in scene.walls)])
 
 
 def build_pymunk(scene):
@@ -145,9 +194,10 @@ def build_pymunk(scene):
     space.gravity = (0.0, -scene.gravity)
     space.collision_slop = 0.005  # [m] as Box2D's; the default of 0.1 is meant for pixels
     shapes = []
-    for (nx, ny), offset in scene.walls:  # a bar 20 m long and 1 m thick
+    half = half_length(scene)
+    for (nx, ny), offset in scene.walls:  # a bar 20 m long, or longer, and 1 m thick
         cx, cy = nx * (offset - 0.5), ny * (offset - 0.5)
-        ends = (cx - 10 * ny, cy + 10 * nx), (cx + 10 * ny, cy - 10 * nx)
+        ends = (cx - half * ny, cy + half * nx), (cx + half * ny, cy - half * nx)
         shapes.append(pymunk.Segment(space.static_body, *ends, 0.5))
     sides = tuple(2 * half for half in scene.size)
     disc = len(sides) == 1
@@ -175,9 +225,9 @@ def build_box2d(scene):
     world.sleeping_enabled = False
     material = pyb2d3.surface_material(friction=scene.friction, restitution=scene.restitution)
     ground = world.create_static_body(position=(0.0, 0.0))
-    for (nx, ny), offset in scene.walls:  # a bar 20 m long and 1 m thick
+    for (nx, ny), offset in scene.walls:  # a bar 20 m long, or longer, and 1 m thick
         center = nx * (offset - 0.5), ny * (offset - 0.5)
-        bar = pyb2d3.box(hx=0.5, hy=10.0, center=center, rotation=math.atan2(ny, nx))
+        bar = pyb2d3.box(hx=0.5, hy=half_length(scene), center=center, rotation=math.atan2(ny, nx))
         ground.create_shape(pyb2d3.shape_def(material=material), bar)
     disc = len(scene.size) == 1
     area = math.pi * scene.size[0] ** 2 if disc else 4 * math.prod(scene.size)

@@ -33,7 +33,7 @@ from pathlib import Path
 from bench_scenes import PEERS, SCENES, build_diffrigid
 
 RUNS, MIN_SECONDS = 5, 1.0  # a median is over at least this many runs and this much time, after a warm-up
-PEER_WORLDS = 32  # worlds in a timed run; Box2D holds 128 at most
+PEER_WORLDS, PEER_BODIES = 32, 1024  # worlds in a timed run, but no more than so many bodies; Box2D holds 128 worlds
 HEADER = "scene engine    worlds  steps/s over peer | compile s  gradient | grad/fwd temp MB | sanity"
 ROW = "{rate:8.3g} {over_peer:9.3g} | {compile_s:9.2f} {grad_compile_s:9.2f} | "
 ROW += "{grad_over_forward:8.2f} {grad_temp_mb:7.0f} | "
@@ -115,10 +115,9 @@ def run_in_process(case):
 
 
 def measure(name):
-    best, rows = 0.0, []
-    for engine, worlds in [(peer, PEER_WORLDS) for peer in SCENES[name](0).peers] + [
-        ("diffrigid", n) for n in SCENES[name](0).worlds
-    ]:
+    best, rows, scene = 0.0, [], SCENES[name](0)
+    peer_worlds = min(PEER_WORLDS, -(-PEER_BODIES // len(scene.x)))
+    for engine, worlds in [(peer, peer_worlds) for peer in scene.peers] + [("diffrigid", n) for n in scene.worlds]:
         row = run_in_process({"scene": name, "engine": engine, "worlds": worlds})
         if engine in PEERS:
             best = max(best, row.get("rate", 0.0))

@@ -152,6 +152,7 @@ SCENES = {
     "width": (lambda v: flat(options={"contact": dr.Contact(width=v)}), (*NOT_NEGATIVE, None)),
     "rest_speed": (lambda v: flat(options={"contact": dr.Contact(rest_speed=v)}), (*NOT_NEGATIVE, None)),
     "sweeps": (lambda v: flat(options={"contact": dr.Contact(sweeps=v)}), INTEGER),
+    "neighbours": (lambda v: flat(options={"contact": dr.Contact(neighbours=v)}), INTEGER),
 }  # fmt: skip
 FORCES = {
     "Drag.linear": (lambda v: forced(dr.Drag(linear=v)), (*ODD, None, np.inf, (1.0, 2.0, 3.0), (np.nan, 0.0))),
@@ -252,6 +253,10 @@ RUNS = {
     "batch dt": (lambda v: dr.rollout_batch(*many(), dt=v, steps=1), (*POSITIVE, None)),
     "batch steps": (lambda v: dr.rollout_batch(*many(), dt=0.1, steps=v), INTEGER),
     "batch chunk": (lambda v: dr.rollout_batch(*many(), dt=0.1, steps=1, chunk=v), tuple(v for v in INTEGER if v is not None and v is not HUGE)),
+    "rollout memory": (lambda v: roll(steps=1, memory=v), tuple(v for v in INTEGER if v is not HUGE)),
+    "batch memory": (lambda v: dr.rollout_batch(*many(), dt=0.1, steps=1, memory=v), tuple(v for v in INTEGER if v is not HUGE)),
+    "missed_pairs world": (lambda v: dr.missed_pairs(v, pair()[1], 0.1), (*RECORD, None, pair)),
+    "missed_pairs dt": (lambda v: dr.missed_pairs(*pair(), v), (*POSITIVE, None)),
     "play": (dr.play, (*RECORD, None, {"a": 1.0}, {})),
 }  # fmt: skip
 FITS = {

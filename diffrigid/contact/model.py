@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
+from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
 from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
@@ -51,6 +52,7 @@ class Contact:
         bodies would meet again before the step ends does not rebound either, but rests.
     sweeps: how many impacts in a row a body may have within one step. One that comes later is found late and
         repaired in the next step. Sweeps that are not needed cost nothing.
+    neighbours: for how many others near a body there is room, in a crowd of 256 bodies and more; see `missed_pairs`.
 
     Differentiable at width > 0 wherever the paths are; at width = 0 with kinks where an impact appears or
     vanishes (grazing), where two coincide, and where sticking turns to slipping.
@@ -65,6 +67,7 @@ class Contact:
     width: Leaf = array(default=0.0)
     rest_speed: Leaf = array(default=1e-3)
     sweeps: int = static(default=4)
+    neighbours: int = static(default=8)
 
     def __call__(self, world: Any, state: State, launch: Callable, dt: Array) -> State:
         """State after a step of length dt (*batch) [s].
@@ -72,6 +75,8 @@ class Contact:
         Args:
             launch: `(state, t0) -> Flight`, free motion to dt from states at their own times t0 (N, *batch).
         """
+        if world.crowd:
+            return step_crowd(world, state, dt)
         t0 = jnp.zeros_like(state.x[:, 0])
         if not ends(world)["a"]:
             return state_at(launch(state, t0), dt)

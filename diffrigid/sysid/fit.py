@@ -96,6 +96,8 @@ def fit(
     _check_parts(loss, solver, intervals, seed, resume)
     check_mapping("observe", observe)
     problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
+    if world.crowd and max(widths) > 0:
+        raise ValueError(f"widths is {widths!r}: expected (0.0,) for so many bodies; use fewer than 256")
     solve = levenberg if solver is None else solver
     z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)

@@ -19,6 +19,7 @@ from jax import Array
 
 from diffrigid import paths
 from diffrigid.convert import positive
+from diffrigid.devices import cut, devices, everywhere, join, over_devices, pieces_of
 from diffrigid.step import aligned, scan_steps
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
@@ -166,10 +167,26 @@ def _side_by_side(leaves: Sequence[Any]) -> np.ndarray:
 
 
 def residuals(plan: Plan, z: Array, data: Data) -> Array:
-    """Weighted residuals (m, B) of B lanes z (n, B); arrays of `data` have a last axis of 1 or B.
+    """Weighted residuals (m, B) of B lanes z (n, B), among the devices; arrays of `data` have a last axis of 1 or B.
 
     Rows of priors come last, shared among the records so that their squares sum to one prior.
     """
+    if len(devices()) == 1:
+        return _residuals(plan, z, data)
+    lanes, (leaves, tree) = z.shape[1], jax.tree.flatten((z, data))
+    own = [leaf is z or (leaf.ndim > 0 and leaf.shape[-1] == lanes > 1) for leaf in leaves]
+    pieces = pieces_of(lanes, lanes)
+    parts = [cut(leaf, -1, *pieces) for leaf, many in zip(leaves, own, strict=True) if many]
+    alike = [leaf for leaf, many in zip(leaves, own, strict=True) if not many]
+
+    def share(parts, alike):
+        mine, alike = iter(part[0] for part in parts), iter(alike)
+        return _residuals(plan, *jax.tree.unflatten(tree, [next(mine if many else alike) for many in own]))[None]
+
+    return everywhere(join(over_devices(share, parts, alike), -1, lanes))
+
+
+def _residuals(plan: Plan, z: Array, data: Data) -> Array:
     lanes = z.shape[1]
     scene = _lanes(plan.slots, data.scene, z)
     world, _ = paths.write(scene.world, scene.state, "contact.width", data.width)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.convert import numbers
+from diffrigid.devices import everywhere
 from diffrigid.state import State
 from diffrigid.step import floats
 from diffrigid.sysid.covariance import Linear
@@ -166,7 +167,8 @@ def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
         ]
         own.append(np.concatenate(rows) if rows else first_own)
     dtype = problem.runs[0].state.x.dtype
-    return Numbers(jnp.asarray(np.stack(shared, -1), dtype), jnp.asarray(np.stack(own, -1), dtype))
+    # Everywhere from the beginning: what a solver returns is, and else all would be compiled again for that.
+    return everywhere(Numbers(jnp.asarray(np.stack(shared, -1), dtype), jnp.asarray(np.stack(own, -1), dtype)))
 
 
 def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:

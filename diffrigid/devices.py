@@ -1,0 +1,68 @@
+"""Work divided over all devices that JAX has, those of other processes too; with one device, as if this were not here.
+
+Devices work without a word to each other: unlike where XLA divides a program by itself, each has its own branches, and
+a pass that none of its worlds needs is skipped.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+SHARE = PartitionSpec("devices")
+
+
+def devices() -> list[jax.Device]:
+    """The devices that share the work: all of the default platform, or the one that `jax.default_device` names."""
+    chosen = jax.config.jax_default_device  # type: ignore[attr-defined]
+    return [chosen] if isinstance(chosen, jax.Device) else jax.devices(chosen)
+
+
+def over_devices(fn: Callable, parts: Any, whole: Any) -> Any:
+    """fn(parts, whole), each device with its share.
+
+    Args:
+        parts: arrays divided along their leading axis, a multiple of the number of devices; so are the results.
+        whole: what every device gets all of; its derivatives are added up.
+    """
+    if len(devices()) == 1:
+        return fn(parts, whole)
+    # Without the check of what varies from device to device, which does not know the loops and solves inside.
+    specs = (SHARE, PartitionSpec())
+    return jax.shard_map(fn, mesh=_mesh(), in_specs=specs, out_specs=SHARE, check_vma=False)(parts, whole)
+
+
+def everywhere(tree: Any) -> Any:
+    """Arrays of which every device has all, so that every process can read them."""
+    if len(devices()) == 1:
+        return tree
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(_mesh(), PartitionSpec()))
+
+
+def _mesh() -> Mesh:
+    return Mesh(np.array(devices()), ("devices",))
+
+
+def pieces_of(count: int, most: int) -> tuple[int, int]:
+    """How many pieces, a multiple of the number of devices, and how long: `count` worlds or some more, `most` each."""
+    many = len(devices())
+    pieces = many * -(-count // (many * most))
+    return pieces, -(-count // pieces)
+
+
+def cut(leaf: Array, axis: int, pieces: int, length: int) -> Array:
+    """One axis in `pieces`, (pieces, ..., length): filled up with copies of the last world."""
+    leaf = jnp.moveaxis(leaf, axis, 0)
+    short = pieces * length - leaf.shape[0]
+    leaf = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], short, axis=0)]) if short else leaf
+    return jnp.moveaxis(leaf.reshape(pieces, length, *leaf.shape[1:]), 1, -1)
+
+
+def join(leaf: Array, axis: int, count: int) -> Array:
+    """Undo `cut`: (pieces, ..., length) to one axis of `count`."""
+    leaf = jnp.moveaxis(leaf, -1, 1)
+    return jnp.moveaxis(leaf.reshape(-1, *leaf.shape[2:])[:count], 0, axis)
