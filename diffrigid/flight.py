@@ -164,18 +164,6 @@ def velocity(f: Flight, s: Array) -> Array:
     return f.v + t * rate
 
 
-def acceleration(f: Flight, s: Array) -> Array:
-    """Acceleration of the centre of mass of one body at time s, (D, *batch) [m/s^2]."""
-    return f.a if f.jolt is None else f.a + (s - f.t0)[None] * f.jolt
-
-
-def torque(f: Flight, s: Array) -> Array | None:
-    """Torque on one body at time s, (A, *batch) [N m]; None: there is none in this world."""
-    if f.tau is None or f.twist is None:
-        return f.tau
-    return f.tau + (s - f.t0)[None] * f.twist
-
-
 def angular_momentum(f: Flight, s: Array) -> Array:
     """Angular momentum of one body about its centre of mass at time s, (A, *batch) [kg m^2/s]."""
     if f.tau is None:

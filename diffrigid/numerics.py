@@ -16,7 +16,6 @@ import numpy as np
 from jax import Array, lax
 
 LARGE = 40  # rows of a matrix, from which on a library that does one after the other is faster than all at once
-SMALL = 6  # rows of a matrix: those of one body in space
 FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
 
 
@@ -82,7 +81,8 @@ def sum_rows(values: Array, index: tuple) -> Array:
     distinct = tuple(dict.fromkeys(index))
     runs = [tuple(i for i in row if i < len(values)) for row in distinct]
     start, length = min(runs[0], default=0), len(runs[0])
-    if length and sum(runs, ()) == tuple(range(start, start + length * len(runs))):
+    regular = all(len(run) == length for run in runs)
+    if length and regular and sum(runs, ()) == tuple(range(start, start + length * len(runs))):
         part = values[start : start + length * len(runs)]
         sums = fold(jnp.add, part.reshape(len(runs), length, *part.shape[1:]), 1)
     else:
@@ -233,26 +233,13 @@ def normalise(a: Array, fallback: Array | None = None) -> Array:
 
 
 def solve_regular(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), without derivative.
-
-    Up to SMALL rows no pivot is sought: such a matrix should be the unit matrix and one that is not negative.
-    """
+    """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), no derivative."""
     matrix, right = lax.stop_gradient((matrix, right))
-    if len(matrix) > LARGE:
-        q, r = lax.linalg.qr(jnp.moveaxis(matrix, (0, 1), (-2, -1)))
-        turned = jnp.swapaxes(q, -2, -1) @ jnp.moveaxis(right, (0, 1), (-2, -1))
-        return jnp.moveaxis(lax.linalg.triangular_solve(r, turned, left_side=True), (-2, -1), (0, 1))
-    if len(matrix) > SMALL:
+    if len(matrix) <= LARGE:
         return _gauss_jordan(matrix, right)
-
-    def eliminate(k, system):
-        column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
-        row = lax.dynamic_index_in_dim(system, k, 0, keepdims=False)
-        row = row * safe_divide(jnp.ones_like(row[0]), lax.dynamic_index_in_dim(column, k, 0, keepdims=False))[None]
-        others = lax.broadcasted_iota(np.int32, column.shape, 0) != k
-        return jnp.where(others[:, None], system - column[:, None] * row[None], row[None])
-
-    return lax.fori_loop(0, len(matrix), eliminate, jnp.concatenate([matrix, right], axis=1))[:, len(matrix) :]
+    q, r = lax.linalg.qr(jnp.moveaxis(matrix, (0, 1), (-2, -1)))
+    turned = jnp.swapaxes(q, -2, -1) @ jnp.moveaxis(right, (0, 1), (-2, -1))
+    return jnp.moveaxis(lax.linalg.triangular_solve(r, turned, left_side=True), (-2, -1), (0, 1))
 
 
 def identity(like: Array) -> Array:

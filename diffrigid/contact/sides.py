@@ -9,7 +9,7 @@ from jax import Array, lax
 
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.distance import reach
-from diffrigid.flight import Flight, acceleration, angular_momentum, orientation, position, torque, velocity
+from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.numerics import apart, dot, norm, rows, sum_rows
 from diffrigid.pytree import array, pytree
 from diffrigid.shapes import HalfSpace, Profile
@@ -71,12 +71,13 @@ def place(side: Side, s: Array, live: Array) -> Placed:
     so = rotations(f.dim)
     q = apart(live, orientation, f, s)
     inverse = apart(live, so.world_inverse, f.inverse_inertia, q)
-    L, tau = angular_momentum(f, s), torque(f, s)
+    L = angular_momentum(f, s)
     w = so.apply(inverse, L)
-    turning = so.precession(L, w) if tau is None else so.precession(L, w) + tau
+    # A torque that varies is left out: its curve may be steep where little is left of the step.
+    turning = so.precession(L, w) if f.tau is None or f.twist is not None else so.precession(L, w) + f.tau
     dw = so.apply(inverse, turning)
-    x, v, a = position(f, s), velocity(f, s), acceleration(f, s)
-    return Placed(x=x, q=q, v=v, w=w, a=a, dw=dw, inverse_mass=f.inverse_mass, inverse_inertia=inverse)
+    x, v = position(f, s), velocity(f, s)
+    return Placed(x=x, q=q, v=v, w=w, a=f.a, dw=dw, inverse_mass=f.inverse_mass, inverse_inertia=inverse)
 
 
 def centre(side: Side, s: Array) -> tuple[Array, Array]:
@@ -104,7 +105,10 @@ def relative_velocity(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) ->
 
 
 def relative_acceleration(at_a: Placed, at_b: Placed, point: Array) -> Array:
-    """Acceleration of a against b at a world point, a + dw x r + w x (w x r) of each, (D, *batch) [m/s^2]."""
+    """Acceleration of a against b at a world point, a + dw x r + w x (w x r) of each, (D, *batch) [m/s^2].
+
+    It steers the search for an impact, no more, and so need not be exact.
+    """
 
     def one(at, arm):
         cross = rotations(arm.shape[0]).cross
