@@ -13,7 +13,9 @@ import diffrigid as dr
 PAGE = (Path(__file__).parent.parent / "notebooks" / "api.md").read_text()
 NAMES = re.findall(r"\.\. auto(?:function|class):: (\w+)", PAGE)
 ELSEWHERE = {"replace", "missed_pairs"}  # that of `dataclasses`; and what needs a crowd: `tests/test_crowd.py`
-MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"}
+MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"} | {
+    "missed_pairs"
+}
 
 
 def examples():
