@@ -46,6 +46,7 @@ class Flight:
     dim: int = static()
 
 
+@jax.jit  # so that it is traced once for all passes of a step
 def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Flight:
     """Free motion of all bodies from `state`, each at its own time t0 (N, *batch), to t1 (*batch) [s]."""
     bodies, varies = world.bodies, not is_constant(world.forces) or bool(world.joints)
