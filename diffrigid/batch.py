@@ -5,6 +5,7 @@ chunks whose temporaries stay in the cache, divided among the devices. Outside, 
 batch axis. Plain `jax.vmap(rollout)` gives the same numbers; its batch axis comes first, in one chunk on one device.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from diffrigid.controls import as_controls, controlled
 from diffrigid.devices import cut, devices, join, over_devices, pieces_of
 from diffrigid.pytree import map_arrays
 from diffrigid.shapes import Disc, HalfSpace, Sphere
@@ -24,8 +26,8 @@ CORNER = 32  # lanes of a contact of shapes with corners: it is searched for, an
 
 
 def rollout_batch(
-    world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, chunk: int | None = None,
-    memory: int = MEMORY,
+    world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, controls: Any = None,
+    chunk: int | None = None, memory: int = MEMORY,
 ) -> State:  # fmt: skip
     """States of B worlds, from `world` and `state` of which any leaf may have a leading batch axis.
 
@@ -33,6 +35,8 @@ def rollout_batch(
         dt: [s].
         steps: T >= 1.
         final_only: return only the last state, (B, N, ...); else all of them, (B, T+1, N, ...).
+        controls: values that forces with a `control` add, by its name; held over each step: (T, D or A) for all
+            worlds, or (B, T, D or A).
         chunk: worlds that run together; default: as many as fit the cache and `memory`.
         memory: [bytes] that reverse mode may save on each device. A batch that would need more saves the starts of its
             chunks, and computes each again; one that still would, the states at every so many steps, as `rollout` does.
@@ -41,7 +45,8 @@ def rollout_batch(
     and the result lies where it was computed (`jax.experimental.multihost_utils.process_allgather` brings it together).
 
     Raises:
-        ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps < 1; memory < 1.
+        ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps < 1; memory < 1;
+            controls that forces do not take, or lack.
 
     Example:
         >>> thrown = dr.replace(state, v=jnp.array([[[0.0, 0.0]], [[1.0, 0.0]], [[2.0, 0.0]]]))  # (B, N, D)
@@ -51,15 +56,25 @@ def rollout_batch(
     """
     _check_leaves(world, state)
     world, state = floats(world, state)
+    length, steps, memory = step_length(dt, state), at_least_one("steps", steps), at_least_one("memory", memory)
     sizes = {size for tree in (world, state) for size in _batch_sizes(tree)}
     if len(sizes) != 1:
         raise ValueError(f"rollout_batch: expected one leading batch axis on some leaf, got lengths {sorted(sizes)}")
-    length, steps, memory = step_length(dt, state), at_least_one("steps", steps), at_least_one("memory", memory)
     count, most = sizes.pop(), _chunk(world) if chunk is None else at_least_one("chunk", chunk)
+    controls = _controls(world, controls, state.x.dtype, steps, count)
     if chunk is None:
         least = 2 * int(np.sqrt(steps)) * _state_bytes(world, state)  # of one world, saved at every so many steps
         most = max(min(most, memory // least), 1)
-    return _run(world, state, length, steps, final_only, count, pieces_of(count, most), memory)
+    return _run(world, state, controls, length, steps, final_only, count, pieces_of(count, most), memory)
+
+
+def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -> Any:
+    """Controls of the whole batch, with the batch last: (T, D or A, B), or 1 where they are alike."""
+    if not isinstance(controls, Mapping):
+        return as_controls(world.forces, controls, dtype, (steps,), (count,))
+    ranks = {name: np.ndim(value) for name, value in controls.items()}
+    last = {k: jnp.moveaxis(value, 0, -1) if ranks[k] == 3 else value for k, value in controls.items()}
+    return as_controls(world.forces, last, dtype, (steps,), (count,))
 
 
 def _check_leaves(world: World, state: State) -> None:
@@ -104,19 +119,28 @@ def _state_bytes(world: World, state: State) -> int:
     return sizes["N"] * (2 * sizes["D"] + sizes["Q"] + sizes["A"]) * state.x.dtype.itemsize
 
 
+def _batch_axes(world: World, controls: Any, count: int) -> list[int | None]:
+    """Of each leaf of the controls the axis of the batch, or None."""
+    names, leaves = controlled(world.forces), jax.tree_util.tree_leaves_with_path(controls)
+    own = [getattr(path[0], "key", None) in names and leaf.shape[-1] == count for path, leaf in leaves]
+    return [leaf.ndim - 1 if many else None for many, (_, leaf) in zip(own, leaves, strict=True)]
+
+
 @jax.jit(static_argnames=("steps", "final_only", "count", "pieces", "memory"))
-def _run(world, state, dt, steps, final_only, count, pieces, memory):
-    leaves, tree = jax.tree.flatten((world, state))
+def _run(world, state, controls, dt, steps, final_only, count, pieces, memory):
+    leaves, tree = jax.tree.flatten((world, state, controls))
     batched = jax.tree.leaves(map_arrays(lambda leaf, letters, _: leaf.ndim > len(letters), (world, state)))
-    split = [cut(leaf, 0, *pieces) for leaf, many in zip(leaves, batched, strict=True) if many]
-    alike = [leaf for leaf, many in zip(leaves, batched, strict=True) if not many]
+    axes = [0 if many else None for many in batched] + _batch_axes(world, controls, count)
+    split = [cut(leaf, axis, *pieces) for leaf, axis in zip(leaves, axes, strict=True) if axis is not None]
+    alike = [leaf for leaf, axis in zip(leaves, axes, strict=True) if axis is None]
 
     def one_chunk(own, alike, dt):
         own, alike = iter(own), iter(alike)
-        world, state = aligned(*jax.tree.unflatten(tree, [next(own if many else alike) for many in batched]))
+        world, state, controls = jax.tree.unflatten(tree, [next(alike if axis is None else own) for axis in axes])
+        world, state = aligned(world, state)
         if final_only:
-            return final_state(world, state, dt, steps, memory)
-        return scan_steps(world, state, jnp.full((steps,), dt), None, (1,) * steps, memory)
+            return final_state(world, state, dt, controls, steps, memory)
+        return scan_steps(world, state, jnp.full((steps,), dt), controls, (1,) * steps, memory)
 
     if _state_bytes(world, state) * steps * pieces[0] * pieces[1] > memory * len(devices()):
         one_chunk = jax.checkpoint(one_chunk)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.contact.crowd import without_room
+from diffrigid.controls import as_controls
 from diffrigid.convert import largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
@@ -49,12 +50,12 @@ def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
     """State after dt [s].
 
     Args:
-        controls: values that forces with a `control` add, by name; held over the step.
+        controls: values (D or A, *batch) that forces with a `control` add, by its name; held over the step.
 
     Raises:
-        ValueError: shapes or types of world and state do not fit; dt <= 0.
+        ValueError: shapes or types of world and state do not fit; dt <= 0; controls that forces do not take, or lack.
 
-    Source: Newton-Euler equations; DESIGN in the README. Differentiable in everything; see `Contact` for where
+    Source: Newton-Euler equations. Differentiable in everything; see `Contact` for where
     it is kinked.
 
     Example:
@@ -64,6 +65,7 @@ def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
     """
     check(world, state)
     world, state = floats(world, state)
+    controls = as_controls(world.forces, controls, state.x.dtype, (), state.x.shape[2:])
     return _step_jit(world, state, step_length(dt, state, batch=True), controls)
 
 
@@ -79,12 +81,13 @@ def rollout(
         times: (T+1,) [s] increasing; times[0] is the time of `state`. Each interval is divided into equal steps
             no longer than dt. Differentiable. Inside jit or vmap, give `substeps`, the number of steps of each
             interval, because it has to be known when tracing.
-        controls: pytree of arrays with a leading axis of T: what forces with a `control` add, by interval.
+        controls: values (T, D or A, *batch) that forces with a `control` add, by its name; held over each interval.
         memory: [bytes] of states that reverse mode may save. If those of all steps do not fit, it saves one after every
             square root of their number, which is the least that it can do with, and computes each step once more.
 
     Raises:
-        ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing; memory < 1.
+        ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing; memory < 1;
+            controls that forces do not take, or lack.
 
     Both modes of differentiation work.
 
@@ -101,11 +104,13 @@ def rollout(
     if times is None:
         count = at_least_one("steps", steps)
         t = longest * jnp.arange(count + 1, dtype=longest.dtype)
+        controls = as_controls(world.forces, controls, state.x.dtype, (count,), state.x.shape[2:])
         states = _rollout_jit(world, state, jnp.broadcast_to(longest, (count,)), controls, (1,) * count, memory)
         return Trajectory(t=t, state=states, world=world)
     t = jnp.asarray(numbers("times", times, None), state.x.dtype)
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
+    controls = as_controls(world.forces, controls, state.x.dtype, (len(t) - 1,), state.x.shape[2:])
     counts = _substeps(t, longest) if substeps is None else _given_substeps(substeps, t.shape[0] - 1)
     return Trajectory(t=t, state=_rollout_jit(world, state, jnp.diff(t), controls, counts, memory), world=world)
 
@@ -129,7 +134,7 @@ def missed_pairs(world: World, state: State, dt: Any) -> Array:
     if not world.crowd:
         return jnp.zeros(leading, jnp.int32)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(leading) :]), state)
-    return lax.map(lambda state: without_room(world, state, length), flat).reshape(leading)
+    return _missed_jit(world, flat, length).reshape(leading)
 
 
 def floats(world: World, state: State) -> tuple[World, State]:
@@ -207,6 +212,11 @@ def aligned(world: World, state: State) -> tuple[World, State]:
 
 
 @jax.jit
+def _missed_jit(world, states, dt):
+    return lax.map(lambda state: without_room(world, state, dt), states)
+
+
+@jax.jit
 def _step_jit(world, state, dt, controls):
     world, state = aligned(world, state)
     return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
@@ -238,15 +248,15 @@ def scan_steps(
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, states)
 
 
-def final_state(world: World, state: State, dt: Array, steps: int, memory: int) -> State:
-    """State after `steps` steps of dt (), without the ones between."""
+def final_state(world: World, state: State, dt: Array, controls: Any, steps: int, memory: int) -> State:
+    """State after `steps` steps of dt (), without the ones between; controls have an axis of `steps` in front."""
     one_step = fenced(world)
 
-    def record(state, dt):
-        return one_step(state, dt, None), None
+    def record(state, inputs):
+        return one_step(state, *inputs), None
 
-    state = with_tangents(state, (world, dt))
-    return _blocked_scan(record, state, jnp.full((steps,), dt), steps, _block_length(state, steps, memory))[0]
+    state, lengths = with_tangents(state, (world, dt, controls)), jnp.full((steps,), dt)
+    return _blocked_scan(record, state, (lengths, controls), steps, _block_length(state, steps, memory))[0]
 
 
 def fenced(world: World):

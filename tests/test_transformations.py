@@ -23,6 +23,7 @@ def assert_same(got, expected, atol):
 # ---- transformations
 
 
+PUCK = dr.Body(dr.Disc(radius=0.1), mass=2.0, x=(0.0, 0.0))
 RUB = CASES["bounce that slides"].parameters
 
 
@@ -159,6 +160,51 @@ def test_controls_hold_through_the_substeps_of_an_interval():
     assert_allclose(spins(u)[1], angle, atol=EXACT)
     by_control = jax.jacrev(lambda u: spins(u)[1][-1])(u)
     assert_allclose(by_control[:, 0], T * (T / 2 + (times[-1] - times[1:])) / inertia, rtol=EXACT)
+
+
+def pushed():
+    return dr.scene({"ball": PUCK}, forces=[dr.Force(body="ball", F=(0.0, 0.0), control="push")])
+
+
+def test_controls_of_a_batch():
+    """Each world its own, or one for all; with trailing axes in `rollout` and `step`, as their states have them."""
+    world, state = pushed()
+    push = jnp.asarray(np.random.default_rng(0).normal(size=(3, 5, 2)))  # (B, T, D)
+    v = jnp.linspace(0.0, 1.0, 6).reshape(3, 1, 2)
+    states, run = dr.replace(state, v=v), {"dt": 0.1, "steps": 5}
+    alone = jnp.stack(
+        [dr.rollout(world, dr.replace(state, v=v[k]), controls={"push": push[k]}, **run).state.v for k in range(3)]
+    )
+    for chunk in (1, 2, 3):
+        batch = dr.rollout_batch(world, states, controls={"push": push}, chunk=chunk, **run)
+        assert_allclose(batch.v, alone, rtol=EXACT)
+    same = dr.rollout_batch(world, states, controls={"push": push[0]}, final_only=True, **run)
+    assert_allclose(same.v[0], alone[0, -1], rtol=EXACT)
+    last = dr.replace(jax.tree.map(lambda leaf: jnp.stack([leaf] * 3, -1), state), v=jnp.moveaxis(v, 0, -1))
+    trailing = dr.rollout(world, last, controls={"push": jnp.moveaxis(push, 0, -1)}, **run).state.v
+    assert_allclose(jnp.moveaxis(trailing, -1, 0), alone, rtol=EXACT)
+    first = dr.step(world, last, 0.1, {"push": jnp.moveaxis(push[:, 0], 0, -1)}).v
+    assert_allclose(first, trailing[1], rtol=EXACT)
+    assert_allclose(dr.rollout(world, last, controls={"push": push[0]}, **run).state.v[..., 0], alone[0], rtol=EXACT)
+
+
+@pytest.mark.parametrize(
+    "controls, message",
+    [
+        (None, r"controls has no 'push': give controls=\{'push': ...\} of shape \(4, 2\)"),
+        ({"pusch": np.zeros((4, 2))}, "controls has no 'push'"),
+        ({"push": np.zeros((4, 2)), "pull": np.zeros((4, 2))}, "no force takes pull: did you mean 'push'"),
+        ({"push": np.zeros((3, 2))}, r"controls\['push'\] has shape \(3, 2\): expected \(4, 2\)"),
+        ({"push": np.full((4, 2), np.nan)}, "expected finite numbers"),
+        ({"push": "hard"}, "expected numbers"),
+        (np.zeros((4, 2)), "controls has no 'push'"),
+    ],
+)
+def test_wrong_controls(controls, message):
+    with pytest.raises(ValueError, match=message):
+        dr.rollout(*pushed(), dt=0.1, steps=4, controls=controls)
+    with pytest.raises(ValueError, match="no force takes push: give Force or Torque a control"):
+        dr.rollout(*dr.scene({"ball": PUCK}), dt=0.1, steps=4, controls={"push": np.zeros((4, 2))})
 
 
 # ---- forces

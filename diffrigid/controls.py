@@ -1,0 +1,56 @@
+"""What is added to forces from outside, interval by interval: `controls` of `step`, `rollout` and `rollout_batch`.
+
+A dictionary by the names that forces have as `control`. Forces of other kinds may read whatever they like.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+from jax import lax
+
+from diffrigid.convert import nearest, numbers
+from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
+
+
+def controlled(forces: tuple) -> dict[str, int]:
+    """How many numbers each control has, by its name."""
+    added = (force for force in forces if isinstance(force, Force | Torque))
+    sizes = {force.control: len(force.F if isinstance(force, Force) else force.tau) for force in added}
+    return {name: size for name, size in sizes.items() if name is not None}
+
+
+def as_controls(forces: tuple, controls: Any, dtype: Any, steps: tuple[int, ...], batch: tuple[int, ...] = ()) -> Any:
+    """Controls as arrays of a type.
+
+    Args:
+        steps: (T,), or () for one step.
+        batch: trailing axes that a control may have; those without are given as many of length one.
+
+    Raises:
+        ValueError: one that a force asks for is missing, has no force, or is not of the shape (*steps, D or A).
+    """
+    sizes = controlled(forces)
+    if controls is None and not sizes:
+        return None
+    given = controls if isinstance(controls, Mapping) else {}
+    for name, size in sizes.items():
+        if name not in given:
+            raise ValueError(f"controls has no {name!r}: give controls={{{name!r}: ...}} of shape {(*steps, size)}.")
+    if not isinstance(controls, Mapping) or any(name not in sizes for name in controls):
+        if all(isinstance(force, Gravity | Drag | Force | Torque | SpringDamper) for force in forces):
+            unused = sorted(set(given) - set(sizes)) or [repr(controls)]
+            hint = nearest(unused[0], sizes) if sizes else "give Force or Torque a control."
+            raise ValueError(f"controls: no force takes {', '.join(unused)}: {hint}")
+
+    def converted(path: Any, value: Any) -> Any:
+        name = getattr(path[0], "key", None) if path else None
+        array = lax.convert_element_type(numbers(f"controls[{name!r}]", value, None), dtype)
+        whole = (*steps, sizes[name]) if name in sizes else steps
+        rest = array.shape[len(whole) :]
+        if array.shape[: len(whole)] != whole or (name in sizes and rest not in ((), batch)):
+            ending = f" or {(*whole, *batch)}" if batch and name in sizes else ""
+            raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {whole}{ending}.")
+        return array.reshape(*whole, *[1] * len(batch)) if name in sizes and not rest else array
+
+    return jax.tree_util.tree_map_with_path(converted, controls)
