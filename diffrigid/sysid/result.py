@@ -17,6 +17,7 @@ from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covar
 from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import best_by_record, levenberg
+from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene, Slot, knows, reference
 from diffrigid.sysid.records import runs, same_data
 from diffrigid.sysid.setup import Problem, by_column, make_problem, make_starts, reach_of, scene_of, with_noise
@@ -65,6 +66,11 @@ class Fit:
     @property
     def agree(self) -> int:
         return self.summary.agree
+
+    @property
+    def orders(self) -> Orders:
+        """Of each start, the best first, and of each of the first three records, the pairs that strike, in order."""
+        return self.summary.orders
 
     @property
     def notes(self) -> tuple[str, ...]:

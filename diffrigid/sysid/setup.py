@@ -234,10 +234,16 @@ def fitted_scenes(problem: Problem, shared: np.ndarray, own: np.ndarray) -> list
     """The scene of every record with the parameters z (a,), (b, R) put in."""
     out: list[Any] = [None] * len(problem.runs)
     for group in problem.groups:
-        for k in group.members:
-            z = jnp.asarray(np.concatenate([shared, own[:, k]]), problem.runs[k].state.x.dtype)
-            out[k] = _put(group.plan.slots, scene_of(problem.runs[k]), z)
+        for k, member in enumerate(group.members):
+            out[member] = fitted_scene(problem, group, k, shared, own)
     return out
+
+
+def fitted_scene(problem: Problem, group: Group, k: int, shared: np.ndarray, own: np.ndarray) -> Scene:
+    """Of record k of a group."""
+    run = problem.runs[group.members[k]]
+    z = jnp.asarray(np.concatenate([shared, own[:, group.members[k]]]), run.state.x.dtype)
+    return _put(group.plan.slots, scene_of(run), z)
 
 
 _put = jax.jit(put, static_argnames="slots")
