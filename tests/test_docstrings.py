@@ -1,6 +1,7 @@
 """Examples of the docstrings run, in the order of the reference, as one session; every public name has one."""
 
 import doctest
+import importlib.util
 import re
 from pathlib import Path
 
@@ -16,6 +17,9 @@ ELSEWHERE = {"replace", "missed_pairs"}  # that of `dataclasses`; and what needs
 MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"} | {
     "missed_pairs"
 }
+
+
+EXTRAS = {"sample": "blackjax"}  # what an example needs beside the package; where it is absent the example does not run
 
 
 def examples():
@@ -38,6 +42,8 @@ def test_examples_run(tmp_path, monkeypatch):
     session = {"dr": dr, "jax": jax, "jnp": jnp, "np": np, "Path": Path}
     runner, wrong = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS), []
     for example in examples():
+        if example.name in EXTRAS and not importlib.util.find_spec(EXTRAS[example.name]):
+            continue
         example.globs = session
         runner.run(example, out=wrong.append, clear_globs=False)
     assert not wrong, "".join(wrong)

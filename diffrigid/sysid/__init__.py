@@ -10,6 +10,7 @@ from diffrigid.sysid.losses import huber, squares, student
 from diffrigid.sysid.profile import profile, with_profiles
 from diffrigid.sysid.records import Record
 from diffrigid.sysid.result import Fit
+from diffrigid.sysid.sampling import sample
 from diffrigid.sysid.segments import segments
 from diffrigid.sysid.sensors import Channel, Homography, Marker, Pinhole, Separation
 from diffrigid.sysid.setup import jacobian_matrix, make_problem, residual_vector, start_vector
@@ -51,6 +52,7 @@ __all__ = [
     "residual_figure",
     "residual_vector",
     "rotation",
+    "sample",
     "sandwich",
     "segments",
     "shares",

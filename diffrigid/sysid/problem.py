@@ -239,8 +239,7 @@ def _prior_rows(plan: Plan, scene: Scene, z: Array) -> list[Array]:
     return rows
 
 
-@partial(jax.jit, static_argnames="plan", compiler_options=QUICK)
-def linearise(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
+def linearised(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
     """Residuals (m, R, S), their Jacobian (m, n, R, S), and the motions of the first few records and starts.
 
     At z (n, R, S), R records and S starts, by forward mode. Motions are states (steps + 1, ..., R, S).
@@ -264,6 +263,7 @@ def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
     return residuals(plan, z.reshape(n, -1), _spread(data, 1, S)).reshape(-1, R, S)
 
 
+linearise = jax.jit(linearised, static_argnames="plan", compiler_options=QUICK)
 evaluate = jax.jit(residuals_of, static_argnames="plan", compiler_options=QUICK)
 
 

@@ -191,7 +191,7 @@ def describe(
     residuals: tuple[dict[str, np.ndarray], ...], scenes: tuple[Scene, ...],
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """The parameters with intervals, and the notes under the table."""
-    places = coordinates((*problem.shared, *problem.own), _references(problem))
+    places = coordinates((*problem.shared, *problem.own), references(problem))
     blind = blind_directions(linear, places)
     quantile = student_quantile(uncertainty.freedom)
     covariance = infinite_where_blind(uncertainty.covariance, blind, linear.shared)
@@ -214,7 +214,8 @@ def describe(
     return tuple(parameters), tuple(notes)
 
 
-def _references(problem: Problem) -> list[np.ndarray]:
+def references(problem: Problem) -> list[np.ndarray]:
+    """Value of each parameter in the scene of the first record that has it."""
     scenes = [scene_of(run) for run in problem.runs]
     return [
         np.asarray(reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths))))

@@ -70,11 +70,16 @@ def _others(fit: Any) -> str:
 
 def text_table(fit: Any) -> str:
     """The table in plain text, with the notes under it."""
-    table = [HEADER, *rows(fit)]
-    widths = [max(len(row[i]) for row in table) for i in range(len(HEADER))]
+    return "\n".join([*laid_out(HEADER, rows(fit)), *below(fit), *(f"! {note}" for note in fit.notes)])
+
+
+def laid_out(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table, in columns, between rules."""
+    table = [header, *rows]
+    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
     rule = "-" * max(map(len, lines))
-    return "\n".join([lines[0], rule, *lines[1:], rule, *below(fit), *(f"! {note}" for note in fit.notes)])
+    return [lines[0], rule, *lines[1:], rule]
 
 
 def html_table(fit: Any) -> str:
