@@ -26,7 +26,7 @@ def examples():
     """Of every name on the page that has one."""
     parser = doctest.DocTestParser()
     for name in NAMES:
-        public = getattr(dr, name, None) or getattr(dr.sysid, name)
+        public = next(getattr(where, name) for where in (dr, dr.sysid, dr.paths) if hasattr(where, name))
         example = parser.get_doctest(public.__doc__, {}, name, None, 0)
         if example.examples:
             yield example

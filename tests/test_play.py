@@ -178,8 +178,12 @@ def test_what_cannot_be_drawn_is_an_error_that_says_how():
         dr.play({"many": front})
     assert batch._repr_html_() is None and front._repr_html_() is None
     dr.play(jax.tree.map(lambda leaf: leaf[0], front))
-    with pytest.raises(ValueError, match="rollout"):
-        dr.play(run.state)
+    of_many = dr.replace(run, state=front.state)  # states as `rollout_batch` returns them
+    with pytest.raises(ValueError, match=r"leaf\[0\]"):
+        dr.play(of_many)
+    with pytest.raises(ValueError, match="`rollout_batch` pick a world"):
+        dr.play(front.state)
+    dr.play(dr.replace(of_many, state=jax.tree.map(lambda leaf: leaf[0], front.state)))
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda run: dr.play(run).height)(run)
     with pytest.raises(ValueError, match="one dimension"):

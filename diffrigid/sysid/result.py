@@ -18,9 +18,18 @@ from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlation
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.orders import Orders
-from diffrigid.sysid.parameters import Scene, Slot, knows, reference
+from diffrigid.sysid.parameters import Scene, Slot, reference
 from diffrigid.sysid.records import runs, same_data
-from diffrigid.sysid.setup import Problem, by_column, make_problem, make_starts, reach_of, scene_of, with_noise
+from diffrigid.sysid.setup import (
+    Problem,
+    by_column,
+    make_problem,
+    make_starts,
+    reach_of,
+    scene_having,
+    scene_of,
+    with_noise,
+)
 from diffrigid.sysid.summary import Parameter, Summary
 from diffrigid.sysid.table import html_table, text_table
 from diffrigid.world import World
@@ -216,11 +225,7 @@ def describe(
 
 def references(problem: Problem) -> list[np.ndarray]:
     """Value of each parameter in the scene of the first record that has it."""
-    scenes = [scene_of(run) for run in problem.runs]
-    return [
-        np.asarray(reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths))))
-        for slot in (*problem.shared, *problem.own)
-    ]
+    return [np.asarray(reference(slot, scene_having(problem, slot))) for slot in (*problem.shared, *problem.own)]
 
 
 def _pieces(slots: tuple[Slot, ...], z: np.ndarray, covariance: np.ndarray):
@@ -232,13 +237,12 @@ def _pieces(slots: tuple[Slot, ...], z: np.ndarray, covariance: np.ndarray):
 
 
 def _shared_parameter(problem: Problem, slot: Slot, z, covariance, quantile: float, blind) -> Parameter:
-    scenes = (scene_of(run) for run in problem.runs)
-    about = reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths)))
+    about = reference(slot, scene_having(problem, slot))
     value, low, high = interval_of(slot, z, covariance, about, quantile)
     note = "at its bound" if slot.kind.at_bound(value) else ""
     if any(slot.name in b.names for b in blind):
         note = "not determined, see below"
-    return Parameter(slot.name, value, low, high, unit_of(slot), note)
+    return Parameter(slot.name, value, low, high, unit_of(problem, slot), note)
 
 
 def _own_parameters(problem: Problem, own: np.ndarray, blocks: list[np.ndarray], quantile: float, blind):
@@ -253,7 +257,7 @@ def _own_parameters(problem: Problem, own: np.ndarray, blocks: list[np.ndarray],
         note = "at its bound" if slot.kind.at_bound(value) else ""
         if any(slot.name in b.names for b in blind):
             note = "not determined, see below"
-        yield Parameter(slot.name, value, low, high, unit_of(slot), note, records)
+        yield Parameter(slot.name, value, low, high, unit_of(problem, slot), note, records)
         first += slot.size
 
 
@@ -273,9 +277,10 @@ def interval_of(slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, q
     return value, value - half, value + half
 
 
-def unit_of(slot: Slot) -> str:
+def unit_of(problem: Problem, slot: Slot) -> str:
     """SI unit; that of a column's bias or of what it observes is the user's."""
-    return "s" if slot.paths[0].split(".")[-1] == "clock" else unit(slot.paths[0])
+    path = slot.paths[0]
+    return "s" if path.split(".")[-1] == "clock" else unit(scene_having(problem, slot).world, path)
 
 
 def _together(covariance: np.ndarray, places, blind) -> list[str]:

@@ -222,7 +222,7 @@ def _posterior(fit: Fit, values: dict[str, np.ndarray], divergent: int) -> Poste
     for name, value in values.items():
         low, high = np.quantile(value, (0.025, 0.975), axis=(0, 1))
         records = len(problem.runs) if slots[name] in problem.own else 0
-        parameters.append(Parameter(name, value.mean((0, 1)), low, high, unit_of(slots[name]), "", records))
+        parameters.append(Parameter(name, value.mean((0, 1)), low, high, unit_of(problem, slots[name]), "", records))
         r_hat[name], size[name] = _quality(value)
     notes = [f"{divergent} steps diverged: the density is too steep somewhere"] if divergent else []
     notes += [f"chains do not agree on {n} (R-hat {r:.3g}): draw more" for n, r in r_hat.items() if r > SETTLED]

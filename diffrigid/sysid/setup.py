@@ -183,9 +183,14 @@ def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
 
 
 def _value(problem: Problem, slot: Slot) -> Any:
-    """Reference of a shared parameter: that of the first record that has it."""
+    """Reference of a parameter: that of the first record that has it."""
+    return reference(slot, scene_having(problem, slot))
+
+
+def scene_having(problem: Problem, slot: Slot) -> Scene:
+    """The scene of the first record that has a parameter."""
     scenes = (scene_of(run) for run in problem.runs)
-    return reference(slot, next(scene for scene in scenes if all(knows(scene, path) for path in slot.paths)))
+    return next(scene for scene in scenes if all(knows(scene, path) for path in slot.paths))
 
 
 def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:

@@ -32,6 +32,11 @@ def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
     Raises:
         ValueError: something else, traced, or a batch.
     """
+    if isinstance(trajectory, State):
+        raise ValueError(
+            f"{name} is a State: expected what `rollout` returns; of states of `rollout_batch` pick a world, "
+            "Trajectory(t=t, state=jax.tree.map(lambda leaf: leaf[0], states), world=world)"
+        )
     if not isinstance(trajectory, Trajectory):
         raise ValueError(f"{name} is a {type(trajectory).__name__}: expected what `rollout` returns, or a dict of them")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trajectory)):
@@ -42,9 +47,11 @@ def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
             f"pick one with jax.tree.map(lambda leaf: leaf[0], {name})"
         )
     if np.ndim(trajectory.state.x) != 3 or batch_rank(trajectory.world):
+        shape = np.shape(trajectory.state.x)
+        first = "0" if len(shape) == 4 and len(trajectory.t) == shape[1] != shape[0] else "..., 0"
         raise ValueError(
-            f"{name}.state.x has shape {np.shape(trajectory.state.x)}, expected (T+1, N, D), and {name}.world without "
-            f"a batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[..., 0], {name}.state)), "
+            f"{name}.state.x has shape {shape}, expected (T+1, N, D), and {name}.world without "
+            f"a batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[{first}], {name}.state)), "
             "and likewise in the leaves of the world that have the batch axis"
         )
     return trajectory
