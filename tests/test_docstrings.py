@@ -15,8 +15,8 @@ PAGE = (Path(__file__).parent.parent / "notebooks" / "api.md").read_text()
 NAMES = re.findall(r"\.\. auto(?:function|class):: (\w+)", PAGE)
 ELSEWHERE = {"replace", "missed_pairs"}  # that of `dataclasses`; and what needs a crowd: `tests/test_crowd.py`
 MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"} | {
-    "missed_pairs"
-}
+    "missed_pairs", "fit_in_pieces", "jumps"
+}  # fmt: skip
 
 
 EXTRAS = {"sample": "blackjax"}  # what an example needs beside the package; where it is absent the example does not run
