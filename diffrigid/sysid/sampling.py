@@ -179,7 +179,7 @@ def _log_volume(slots: Sequence[Slot], z: Array, refer: Sequence[Array]) -> Arra
 def _side_by_side(parts: Sequence[tuple[Plan, tuple[int, ...]]], loss: Any, a: int, b: int) -> Any:
     """Cost of one z (n,), with its gradient by forward mode, of which `vmap` makes lanes on the last axis.
 
-    As a batch of the usual kind, in front, a step would compute both ways of each of its branches.
+    Inside, a batch lies last, and steps on one that lies in front are slower.
     """
 
     @jax.jit  # traced once, however often the loops around it are
