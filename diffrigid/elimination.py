@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.numerics import apart, rows_or_zeros
+from diffrigid.numerics import apart, opaque_true, rows_or_zeros
 
 ROUNDING = 1e2  # times the spacing of numbers at the diagonal: a pivot of a loop that is no larger is zero
 
@@ -149,7 +149,7 @@ def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
     """All levels, from the blocks (n + pairs, E, E, *batch) of the joints with themselves, then of `plan.pairs`."""
     count, rounding = len(plan.places), 0.0 if plan.is_tree else ROUNDING * jnp.finfo(blocks.dtype).eps
     tiny = rounding * jnp.stack([blocks[:count, e, e] for e in range(blocks.shape[1])], axis=1)
-    factors, live = [], jnp.ravel(blocks)[0] < jnp.inf
+    factors, live = [], opaque_true(blocks)
     for level in plan.levels:
         own = rows_or_zeros(blocks, level.blocks)
         inverse, near = apart(live, _inverse, own[:, 0], rows_or_zeros(tiny, level.pivots)), own[:, 1:]

@@ -46,6 +46,7 @@ class Flight:
     dim: int = static()
 
 
+@jax.jit  # so that it is traced once for all passes of a step
 def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Flight:
     """Free motion of all bodies from `state`, each at its own time t0 (N, *batch), to t1 (*batch) [s]."""
     bodies, varies = world.bodies, not is_constant(world.forces) or bool(world.joints)
@@ -83,10 +84,11 @@ def _has_torque(world: Any) -> bool:
     return bool(world.joints) or any(getattr(force, "twists", True) for force in world.forces)
 
 
-def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion, Motion, Motion]:
-    """Rates at the anchor, the motion after T (N, *batch) [s], and its rates then.
+def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion, Motion, Array, Array]:
+    """Rates at the anchor, their mean over T (N, *batch) [s], the mean of the first three stages' accelerations
+    (N, D, *batch) [m/s^2], which moves x by T^2 / 2, and the rate of phi at the end (N, A, *batch) [rad/s].
 
-    Those of v and L at the end are not at hand but 0. The four stages are a loop, so that forces are compiled once.
+    The four stages are a loop, so that forces are compiled once.
     """
     so = rotations(f.dim)
 
@@ -116,29 +118,26 @@ def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion
     start = Motion(x=f.x, phi=jnp.zeros_like(f.L), v=f.v, L=f.L)
     still = jax.tree.map(jnp.zeros_like, start)
     _, k = lax.scan(stage, still, jnp.array([0.0, 0.5, 0.5, 1.0], f.x.dtype))
-    end = after(jax.tree.map(lambda k: (k[0] + 2.0 * (k[1] + k[2]) + k[3]) / 6.0, k), 1.0)
     first = jax.tree.map(lambda k: k[0], k)
-    return first, end, replace(still, x=end.v, phi=turning(end, placed(end)))
+    mean = jax.tree.map(lambda k: (k[0] + 2.0 * (k[1] + k[2]) + k[3]) / 6.0, k)
+    end = after(mean, 1.0)
+    return first, mean, (k.v[0] + k.v[1] + k.v[2]) / 3.0, turning(end, placed(end))
 
 
-def _along(f: Flight, begin: Motion, motion: Motion, rate: Motion, T: Array, has_torque: bool) -> Flight:
-    """The flight on the curves that begin with some rates and end with a motion; where T is 0 they are straight."""
-    T, f = T[:, None], replace(f, a=begin.v)
-    jerk = safe_divide(6.0 * (motion.x - f.x - T * (f.v + 0.5 * T * f.a)), T**3)
-    jolt = safe_divide(2.0 * (motion.v - f.v - T * f.a), T**2)
-    if not has_torque:  # then L is kept, and the series is better
-        return replace(f, jerk=jerk, jolt=jolt)
-    first = begin.phi
-    turn = jnp.stack(
-        [
-            first,
-            safe_divide(3.0 * motion.phi - T * (2.0 * first + rate.phi), T**2),
-            safe_divide(T * (first + rate.phi) - 2.0 * motion.phi, T**3),
-        ],
-        axis=1,
+def _along(f: Flight, first: Motion, mean: Motion, early: Array, last: Array, T: Array, has_torque: bool) -> Flight:
+    """The flight on the curves with these rates, as `_runge_kutta` returns them; where T is 0 they are straight.
+
+    From rates, not from positions: over a short time after an impact those differ by less than they are rounded.
+    """
+    T = T[:, None]
+    f = replace(
+        f, a=first.v, jerk=safe_divide(3.0 * (early - first.v), T), jolt=safe_divide(2.0 * (mean.v - first.v), T)
     )
-    twist = safe_divide(2.0 * (motion.L - f.L - T * begin.L), T**2)
-    return replace(f, jerk=jerk, jolt=jolt, tau=begin.L, twist=twist, turn=turn)
+    if not has_torque:  # then L is kept, and the series is better
+        return f
+    bend = safe_divide(3.0 * mean.phi - 2.0 * first.phi - last, T)
+    turn = jnp.stack([first.phi, bend, safe_divide(first.phi + last - 2.0 * mean.phi, T**2)], axis=1)
+    return replace(f, tau=first.L, twist=safe_divide(2.0 * (mean.L - first.L), T), turn=turn)
 
 
 def position(f: Flight, s: Array) -> Array:

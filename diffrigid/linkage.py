@@ -31,7 +31,7 @@ from diffrigid.constraints import (
 )
 from diffrigid.elimination import Factor, factorise, plan, substitute
 from diffrigid.joints import Pose
-from diffrigid.numerics import apart, dot, rows_or_zeros
+from diffrigid.numerics import apart, dot, opaque_true, rows_or_zeros
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, rotations
 
@@ -68,7 +68,7 @@ class Linkage:
 def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> Linkage:
     """Of the joints of a world at these poses (N, D, *batch), (N, Q, *batch)."""
     so, ends = rotations(bodies.dim), ends_of(joints)
-    groups, live = placed(joints, statics, x, q), jnp.ravel(x)[0] < jnp.inf
+    groups, live = placed(joints, statics, x, q), opaque_true(x)
     inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q)
     inverse_mass = 1.0 / bodies.mass
     sides = apart(live, functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
@@ -166,7 +166,7 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench) -> Wrench:
     """The forces of a world with those added that keep its joints."""
-    state = apart(_live(state), lambda state: state, state)  # else computed again for every use of it
+    state = apart(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
     given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1))
@@ -176,14 +176,9 @@ def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wren
     def falling(groups: tuple[Placed, ...], twists: Array, free: Array) -> Array:
         return joint_accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
 
-    target = apart(_live(state), falling, link.groups, _twists(state), free)
+    target = apart(opaque_true(state.x), falling, link.groups, _twists(state), free)
     forces = given + _pull(link, _multipliers(link, target))
     return Wrench(F=forces[:, : so.D], tau=forces[:, so.D :])
-
-
-def _live(state: State) -> Array:
-    """True, for `apart`."""
-    return jnp.ravel(state.x)[0] < jnp.inf
 
 
 def _twists(state: State) -> Array:
@@ -212,7 +207,7 @@ def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> St
 
     Both by J at the poses as they come, so that the velocities are then on the joints up to the displacement.
     """
-    state = apart(_live(state), lambda state: state, state)  # else computed again for every use of it
+    state = apart(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     off = jnp.stack([joint_errors(so, link.groups), _rates(link, _twists(state))])
     moved, kicked = jax.vmap(lambda off: _moved(link, _pull(link, _multipliers(link, off))))(off)

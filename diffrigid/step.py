@@ -14,7 +14,7 @@ from diffrigid.contact.crowd import without_room
 from diffrigid.convert import largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
-from diffrigid.numerics import with_tangents
+from diffrigid.numerics import opaque_true, with_tangents
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.state import State
 from diffrigid.world import World, check, check_kinds
@@ -260,9 +260,7 @@ def fenced(world: World):
         def again(state):
             return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
 
-        return lax.cond(
-            jnp.ravel(dt)[0] < jnp.inf, jax.checkpoint(again, prevent_cse=False), lambda state: state, state
-        )
+        return lax.cond(opaque_true(dt), jax.checkpoint(again, prevent_cse=False), lambda state: state, state)
 
     return jax.checkpoint(one_step, prevent_cse=False)
 

@@ -56,6 +56,21 @@ def test_batch_is_loop(axis):
     assert_same(together, jax.tree.map(lambda *leaves: jnp.stack(leaves, axis), *alone), ROUNDING)
 
 
+def test_vmap_keeps_branches():
+    """One that no world needs is left out, forward and in reverse mode; else vmap would compute every one for all."""
+
+    def energy(world, state):
+        return dr.kinetic_energy(world.bodies, dr.step(world, state, 1 / 60)).sum()
+
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *variants())
+    for fn in (energy, jax.grad(energy)):
+        alone, together = (
+            jax.jit(fn).lower(*args).as_text() for fn, args in ((fn, variants()[0]), (jax.vmap(fn), batch))
+        )
+        assert together.count("stablehlo.case") == alone.count("stablehlo.case") > 0
+        assert together.count("stablehlo.while") == alone.count("stablehlo.while")
+
+
 def test_batch_of_states_shares_a_world():
     world, _ = variants()[0]
     states = [state for _, state in variants()]

@@ -25,7 +25,7 @@ from diffrigid.contact.impulse import impulses
 from diffrigid.contact.sides import Side
 from diffrigid.contact.strikes import Material, law, materials, strikes_of
 from diffrigid.flight import launch, orientation, state_at
-from diffrigid.numerics import FOUND, dot, norm, rows
+from diffrigid.numerics import FOUND, dot, norm, rows, some
 from diffrigid.pytree import map_arrays, pytree, replace
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State, rotations
@@ -177,8 +177,9 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
         flight = jax.tree.map(lambda leaf: leaf[0], launch(crowd.world, anchors.state, None, anchors.t0, crowd.dt))
         bodies = Side(flight=flight, since=anchors.since[0], shape=crowd.shape)
         following = checkpoint_name(_next(crowd, walls, near, lax.stop_gradient(bodies)), FOUND)
-        after = lax.cond(following.there[0], lambda a: _meet(crowd, walls, following, bodies, a), lambda a: a, anchors)
-        return after, following.there[0]
+        any_there = some(following.there)
+        after = lax.cond(any_there, lambda a: _meet(crowd, walls, following, bodies, a), lambda a: a, anchors)
+        return after, any_there
 
     def maybe(carry: tuple[Anchors, Array], _: None) -> tuple[tuple[Anchors, Array], None]:
         return lax.cond(carry[1], lambda anchors, _: one_round(anchors), lambda *carry: carry, *carry), None
@@ -214,8 +215,8 @@ def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Next:
     most = jnp.minimum(near.found.max(), len(near.other))
     best = jnp.full_like(speed, jnp.inf), jnp.zeros_like(speed), jnp.zeros_like(me)
     best = lax.fori_loop(0, most, body, best)
-    for some in walls:
-        best, _ = lax.scan(wall, best, lax.stop_gradient(some))
+    for kind in walls:
+        best, _ = lax.scan(wall, best, lax.stop_gradient(kind))
     first, _, other = best
     back = pick(other, jnp.minimum(other, count - 1))
     lead = (first < jnp.inf) & ((other >= count) | ((back == me) & (me < other)))
@@ -233,10 +234,10 @@ def _meet(crowd: Crowd, walls: list[Walls], following: Next, bodies: Side, ancho
     side_a, side_b = _at(bodies, a), _at(bodies, b)
     own, others = _at(crowd.materials, a), _at(crowd.materials, b)
     blow = _blow(crowd, a, side_a, own, side_b, others, moves)
-    for some in walls:
-        row = following.b - some.number[0]
-        hit = there & (row >= 0) & (row < len(some.number))
-        side, others = _of_rows((some.side, some.materials), jnp.clip(row, 0, len(some.number) - 1), a)
+    for kind in walls:
+        row = following.b - kind.number[0]
+        hit = there & (row >= 0) & (row < len(kind.number))
+        side, others = _of_rows((kind.side, kind.materials), jnp.clip(row, 0, len(kind.number) - 1), a)
         blow = jax.tree.map(functools.partial(jnp.where, hit), _blow(crowd, a, side_a, own, side, others, hit), blow)
     on, t, P, arm_a, arm_b = blow
 

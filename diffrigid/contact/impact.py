@@ -29,7 +29,19 @@ from diffrigid.contact.sides import (
     reach_of,
     relative_acceleration,
 )
-from diffrigid.numerics import FOUND, apart, dot, fold, implicit_root, norm, safe_divide, safe_sqrt, softplus
+from diffrigid.numerics import (
+    FOUND,
+    apart,
+    dot,
+    fold,
+    implicit_root,
+    norm,
+    opaque_true,
+    safe_divide,
+    safe_sqrt,
+    softplus,
+    some,
+)
 from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere, radius, vertices
 from diffrigid.state import rotations
 
@@ -56,7 +68,7 @@ def find_impact(
 
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
     """
-    live = jnp.any(t1 > 0)
+    live = opaque_true(t1)
     if closed_form(a.shape, b.shape, straight):
         s0, level, found = apart(live, functools.partial(approach, straight=straight), a, b, t1, width)[:3]
     else:
@@ -141,7 +153,7 @@ def meet_on_line(P: Array, W: Array, R: Array, width: Array | None) -> tuple[Arr
 
 def _if_smooth(width: Array | None, smooth, exact, *args: Array) -> Array:
     """smooth(*args) if any width is positive, else exact(*args)."""
-    return exact(*args) if width is None else lax.cond(jnp.any(width > 0), smooth, exact, *args)
+    return exact(*args) if width is None else lax.cond(some(width > 0), smooth, exact, *args)
 
 
 def _approach_parabola(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:
@@ -189,7 +201,7 @@ def _approach_search(a: Side, b: Side, t1: Array, width: Array | None) -> tuple[
     frozen_a, frozen_b = lax.stop_gradient((a, b))
     size = jnp.minimum(reach_of(a), reach_of(b))
     near = checkpoint_name(_advance(frozen_a, frozen_b, start, t1, NEAR * size), FOUND)
-    live = jnp.any(t1 > 0)
+    live = opaque_true(t1)
 
     def smooth(near):
         return _closest_level(a, b, near, t1 - start, width, live)  # type: ignore[arg-type]
@@ -251,7 +263,7 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
     third derivative can be, which takes two or three advances. A contact that touches and separates may be passed for
     as long as its parabola stays open.
     """
-    live, span = jnp.any(t1 > 0), jnp.maximum(t1 - start, 0.0)
+    live, span = opaque_true(t1), jnp.maximum(t1 - start, 0.0)
     (spin_a, jerk_a), (spin_b, jerk_b) = _unsteady(a, span), _unsteady(b, span)
     spinning, jerk = spin_a + spin_b, jerk_a + jerk_b
 
@@ -268,7 +280,7 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
 
     def busy(carry):
         count, s, dt = carry
-        return (count == 0) | ((count < ADVANCES) & jnp.any((dt > 0) & (s < t1)))
+        return (count == 0) | ((count < ADVANCES) & some((dt > 0) & (s < t1)))
 
     def advance(carry):
         count, s, dt = carry
@@ -305,7 +317,7 @@ def _polish(
 
     def busy(carry):
         count, _, dt, *_ = carry
-        return (count <= POLISH) & jnp.any(jnp.abs(dt) > slack * span)
+        return (count <= POLISH) & some(jnp.abs(dt) > slack * span)
 
     def towards(carry):
         count, s, _, _, inside = carry

@@ -24,7 +24,7 @@ from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, sum_of_t
 from diffrigid.contact.strikes import is_rolling, materials, mixed, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
-from diffrigid.numerics import apart, constant, dot, fold
+from diffrigid.numerics import apart, constant, dot, fold, opaque_true, some
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
@@ -79,7 +79,7 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
         next impacts; whether the slots hold them and all are isolated, exact and do not rest, a bool; how many slots
         the fullest world needs.
     """
-    moving, live = len(world.names), jnp.any(dt > 0)
+    moving, live = len(world.names), opaque_true(dt)
     tie = (jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt)[None]
     many = 1 + max(max(table.b) for table in tables)
 
@@ -99,16 +99,16 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
         hit = first <= dt[None]
         lead = (hit & (other > lax.broadcasted_iota(other.dtype, other.shape, 0))).astype(other.dtype)
         alone = fold(jnp.logical_and, ~hit | ((other < many) & (first > RESTS)), 0)
-        return lead, jnp.where(hit, other, -1.0), jnp.all(alone)
+        return lead, jnp.where(hit, other, -1.0), ~alone
 
     # Apart: times are compared with each other, and must not be computed twice with another rounding.
     times = [_times(live, world, table, flight, since, dt) for table in tables]
     first = apart(live, first_of, times)
-    lead, other, alone = apart(live, in_slots, first, apart(live, with_what, times, first))
+    lead, other, crossed = apart(live, in_slots, first, apart(live, with_what, times, first))
     before = constant(tuple(tuple(float(i < j) for j in range(moving)) for i in range(moving)), str(dt.dtype))
     rank = sum_of_terms(lax.expand_dims(before, range(2, 1 + lead.ndim)), lead[:, None], 0)[:, 0]
-    needed = jnp.max(fold(jnp.add, lead, 0))
-    isolated = alone & (needed <= ROUNDS * slots_of(moving)) & ~jnp.any(world.contact.width > 0)
+    needed = fold(jnp.add, lead, 0)
+    isolated = ~some(crossed | (needed > ROUNDS * slots_of(moving)) | (world.contact.width > 0))
     return Next(lead, rank, other), isolated, needed
 
 
@@ -116,14 +116,14 @@ def meet_in_rounds(
     world: Any, tables: tuple[Table, ...], following: Next, needed: Array, anchors: Anchors, launch: Any, dt: Array
 ) -> Anchors:
     """The anchors after the next impact of each body; rounds that no world needs are left out."""
-    count, live = slots_of(len(world.names)), jnp.any(dt > 0)
+    count, live = slots_of(len(world.names)), opaque_true(dt)
 
     @jax.checkpoint
     def meet_from(begin, anchors):
         return meet(world, tables, fill_slots(tables, count, following, begin, live), anchors, launch, dt)
 
     def one_round(anchors, begin):
-        return lax.cond(needed > begin, meet_from, lambda _, anchors: anchors, begin, anchors), None
+        return lax.cond(some(needed > begin), meet_from, lambda _, anchors: anchors, begin, anchors), None
 
     begins = constant(tuple(float(count * k) for k in range(ROUNDS)), str(dt.dtype))
     return lax.scan(one_round, anchors, begins)[0]
@@ -190,7 +190,7 @@ def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Ar
         rests = (root <= world.contact.rest_speed * R) & (s <= dt)
         return jnp.where(rests, RESTS, s)
 
-    live = jnp.any(dt > 0)
+    live = opaque_true(dt)
     lines = (*apart(live, at_start, bodies.flight), bodies.flight.t0, since, bodies.shape.radius)
     return _allowed(table, apart(live, jax.vmap(jax.vmap(one, (None, 0)), (0, None)), lines, lines))
 
@@ -210,7 +210,7 @@ def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> 
 
 
 def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
-    so, live, f = rotations(a.flight.dim), jnp.any(dt > 0), a.flight
+    so, live, f = rotations(a.flight.dim), opaque_true(dt), a.flight
     straight = relative_path_is_straight(world, both_move=False)
     names = ("restitution", "restitution_falloff")
     own, others = (materials(world, of, names) for of in (tuple(range(len(world.names))), table.b))

@@ -35,7 +35,7 @@ from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, is_rolling, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.linkage import islands, linkage, spread
-from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide, with_tangents
+from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide, some, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
@@ -104,7 +104,12 @@ class Contact:
             following, isolated, needed = next_impacts(world, tables, flight, anchors.since, dt)
 
             def isolated_pass():
-                return meet_in_rounds(world, tables, following, needed, anchors, launch, dt), resting, needed > 0, rests
+                return (
+                    meet_in_rounds(world, tables, following, needed, anchors, launch, dt),
+                    resting,
+                    some(needed > 0),
+                    rests,
+                )
 
             def any_pass():
                 return one_pass(anchors, resting, found, rests, phase)
@@ -157,8 +162,8 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
         mu = jnp.where(push, 0.0, friction)
         return _apply(world, anchors, flight, strikes, (target, mu, most), kick, lever, held_for)
 
-    any_now = jnp.any(now)
-    return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, jnp.any(resting)
+    any_now = some(now)
+    return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, some(resting)
 
 
 def _rows_of(flags: tuple[bool, ...], like: Array) -> Array:

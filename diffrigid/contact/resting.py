@@ -10,7 +10,7 @@ from diffrigid.contact.impulse import impulses
 from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sides import at_colliders
 from diffrigid.contact.together import solve_together
-from diffrigid.numerics import safe_sqrt
+from diffrigid.numerics import safe_sqrt, some
 from diffrigid.pytree import array, pytree, static
 
 
@@ -53,9 +53,7 @@ def solve_impulses(
     others = lax.stop_gradient(others)
     shared = strikes.active & ((others > 1) | (mobility.link is not None))
     by_itself = strikes.active & ~shared
-    alone = lax.cond(
-        jnp.any(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu
-    )
+    alone = lax.cond(some(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu)
     scale = lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
     cone = Cone(
         on=shared.astype(others.dtype), crowd=jnp.maximum(others, 1.0), scale=scale, normal=strikes.normal,
@@ -64,7 +62,7 @@ def solve_impulses(
     arms = Arms(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, jac=strikes.jac, spin=strikes.spin, a=strikes.a, b=strikes.b
     )  # fmt: skip
-    return alone + solve_together(jnp.any(shared), cone, strikes.v_rel, arms, mobility)
+    return alone + solve_together(some(shared), cone, strikes.v_rel, arms, mobility)
 
 
 def _none(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:

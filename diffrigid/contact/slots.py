@@ -19,7 +19,7 @@ from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
 from diffrigid.contact.strikes import law, materials, strikes_of
 from diffrigid.flight import Flight, orientation
-from diffrigid.numerics import apart, dot, fold, pack
+from diffrigid.numerics import apart, dot, fold, opaque_true, pack
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 
@@ -52,7 +52,7 @@ class Blow(NamedTuple):
 
 def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, launch: Any, dt: Array) -> Anchors:
     """The anchors after the impacts in the slots."""
-    flight, so, live = launch(anchors.state, anchors.t0), rotations(world.dim), jnp.any(dt > 0)
+    flight, so, live = launch(anchors.state, anchors.t0), rotations(world.dim), opaque_true(dt)
     moving, count = len(world.names), slots.a.shape[0]
     movers = [b for table, b in zip(tables, slots.b, strict=True) if table.b[0] < moving]
     weights = jnp.concatenate([slots.a, *movers])  # a of all slots, then b of all slots

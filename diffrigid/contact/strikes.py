@@ -1,5 +1,6 @@
 """The contacts of all pairs of a world, and the rows of its joints, as one list, whatever their kinds."""
 
+import functools
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from diffrigid.contact.sides import Placed, Side, centre, contacts_of, place, re
 from diffrigid.contact.stops import find_stops, is_drive, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
-from diffrigid.numerics import apart, constant, dot, norm, rows
+from diffrigid.numerics import apart, constant, dot, norm, opaque_true, rows, some
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace, Profile
 from diffrigid.state import rotations
@@ -29,7 +30,7 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     width, parts = world.contact.width, []
     for pairs in world.pairs:
         each = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, at_end, width))
-        part = apart(jnp.any(dt > 0), each, *sides_of(world, pairs, flight, since))
+        part = apart(opaque_true(dt), each, *sides_of(world, pairs, flight, since))
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     jac = None
     if stops_of(world):
@@ -53,7 +54,7 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
     both_move = a.flight is not None and b.flight is not None
     straight, rest_speed = relative_path_is_straight(world, both_move), world.contact.rest_speed
     s, hit, level, slack = find_impact(a, b, dt, width, straight, rest_speed, at_end)
-    live = jnp.any(dt > 0)
+    live = opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
     contacts = contacts_of(a, at_a, b, at_b)
     # At the end those too that the next of a pile fell away from, which may close again once it is held.
@@ -107,13 +108,13 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
         pull = jnp.zeros_like(dt)
         for f in (side.flight for side in (a, b) if side.flight is not None):
             pull = pull + norm(f.a) + (0.0 if f.jerk is None else dt * norm(f.jerk))
-        return jnp.any(apart <= dt * (closing + 0.5 * dt * pull) + margin)
+        return apart <= dt * (closing + 0.5 * dt * pull) + margin
 
     since = jnp.zeros_like(flight.t0)
     if stops_of(world):
         return jnp.asarray(True)
-    near = [jnp.any(jax.vmap(one)(*sides_of(world, pairs, flight, since))) for pairs in world.pairs]
-    return jnp.any(jnp.stack(near))
+    near = [some(jax.vmap(one)(*sides_of(world, pairs, flight, since))) for pairs in world.pairs]
+    return functools.reduce(jnp.logical_or, near)
 
 
 def ends(world: Any) -> dict[str, tuple[int, ...]]:

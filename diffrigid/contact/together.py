@@ -31,7 +31,7 @@ from jax.ad_checkpoint import checkpoint_name
 from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
-from diffrigid.numerics import FOUND, dot, identity, norm, safe_divide, solve_regular
+from diffrigid.numerics import FOUND, dot, identity, norm, safe_divide, solve_regular, some
 from diffrigid.pytree import array, pytree, replace
 
 ROUNDS = 40  # at most, of Newton's method
@@ -160,7 +160,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
     def busy(carry):
         count, _, best, error, since = carry
         small = jnp.where(since < PATIENCE, tolerance, jnp.where(since < 5 * PATIENCE, 1e-3, jnp.inf))
-        return (count < ROUNDS) & jnp.any(error > small * speed(best) + least)
+        return (count < ROUNDS) & some(error > small * speed(best) + least)
 
     def speed(P):
         return jnp.max(cone.scale[:, None] * jnp.abs(P), (0, 1))
