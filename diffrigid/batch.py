@@ -53,6 +53,9 @@ def rollout_batch(
         >>> ends = dr.rollout_batch(world, thrown, dt=1 / 60, steps=30, final_only=True)
         >>> ends.x[:, 0, 0].round(6).tolist()
         [0.0, 0.5, 1.0]
+        >>> states = dr.rollout_batch(world, thrown, dt=1 / 60, steps=30)  # (B, T+1, N, D); to look at the last world:
+        >>> last = jax.tree.map(lambda leaf: leaf[2], states)
+        >>> page = dr.play(dr.Trajectory(t=jnp.arange(31) / 60, state=last, world=world))
     """
     _check_leaves(world, state)
     world, state = floats(world, state)

@@ -192,7 +192,7 @@ def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array) -> Array
 
     def resisting(joint: Any, a: Pose, b: Pose, u: Array) -> Array:
         along = by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0].reshape(u.shape)
-        return -joint.damping * (along * u).sum((0, 1)) * along
+        return -(joint.damping * (along * u).sum((0, 1)))[None, None] * along
 
     for group, at in zip(joints, link.groups, strict=True):
         if getattr(group, "damping", None) is not None:

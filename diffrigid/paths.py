@@ -20,6 +20,7 @@ from jax import Array
 from diffrigid import so2
 from diffrigid.convert import nearest
 from diffrigid.forces import Gravity
+from diffrigid.joints import Revolute
 from diffrigid.pytree import array_fields, letters_of, replace
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
@@ -32,6 +33,8 @@ UNITS = {
     "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
     "restitution_falloff": "s/m", "rolling_friction": "m", "spinning_friction": "m",
 }  # fmt: skip
+ABOUT = {"lower": "rad", "upper": "rad", "speed": "rad/s", "friction": "N m", "damping": "N m s"}  # an axis
+ALONG = {"lower": "m", "upper": "m", "speed": "m/s", "friction": "N", "damping": "N s/m"}
 
 
 class Place(NamedTuple):
@@ -43,7 +46,12 @@ class Place(NamedTuple):
 
 
 def read(world: World, state: State, path: str) -> Array:
-    """Value of a parameter, without batch axes: shape () or (D,) or as its leaf has it."""
+    """Value of a parameter, without batch axes: shape () or (D,) or as its leaf has it.
+
+    Example:
+        >>> dr.paths.read(world, state, "ball.x").tolist()
+        [0.0, 1.0]
+    """
     place = places(world, path)[0]
     leaf: Any = (world, state)
     for key in place.chain:
@@ -60,6 +68,11 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
     Raises:
         ValueError: there is no such parameter, or the value has another shape. Coefficients without the name of a
             body take a number for all.
+
+    Example:
+        >>> thrown = dr.paths.write(world, state, "ball.v", (0.0, 2.0))  # world and state; those before do not change
+        >>> dr.rollout(*thrown, dt=1 / 60, steps=30).state.x[-1, 0].round(2).tolist()
+        [0.0, 0.77]
     """
     pair: Any = (world, state)
     for place in places(world, path):
@@ -67,9 +80,12 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
     return pair
 
 
-def unit(path: str) -> str:
-    """SI unit of a parameter, by its last name; "" where it has none or is unknown."""
-    return UNITS.get(path.split(".")[-1], "")
+def unit(world: World, path: str) -> str:
+    """SI unit of a parameter; "" where it has none or is unknown."""
+    owner, _, field = path.rpartition(".")
+    kinds = [joint for names, joint in zip(world.joint_names, world.joints, strict=True) if owner in names]
+    along = {} if not kinds else ABOUT if isinstance(kinds[0], Revolute) else ALONG
+    return along.get(field, UNITS.get(field, ""))
 
 
 def places(world: World, path: str) -> list[Place]:

@@ -1,6 +1,7 @@
 """Examples of the docstrings run, in the order of the reference, as one session; every public name has one."""
 
 import doctest
+import importlib.util
 import re
 from pathlib import Path
 
@@ -14,15 +15,18 @@ PAGE = (Path(__file__).parent.parent / "notebooks" / "api.md").read_text()
 NAMES = re.findall(r"\.\. auto(?:function|class):: (\w+)", PAGE)
 ELSEWHERE = {"replace", "missed_pairs"}  # that of `dataclasses`; and what needs a crowd: `tests/test_crowd.py`
 MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"} | {
-    "missed_pairs"
-}
+    "missed_pairs", "fit_in_pieces", "jumps"
+}  # fmt: skip
+
+
+EXTRAS = {"sample": "blackjax"}  # what an example needs beside the package; where it is absent the example does not run
 
 
 def examples():
     """Of every name on the page that has one."""
     parser = doctest.DocTestParser()
     for name in NAMES:
-        public = getattr(dr, name, None) or getattr(dr.sysid, name)
+        public = next(getattr(where, name) for where in (dr, dr.sysid, dr.paths) if hasattr(where, name))
         example = parser.get_doctest(public.__doc__, {}, name, None, 0)
         if example.examples:
             yield example
@@ -38,6 +42,8 @@ def test_examples_run(tmp_path, monkeypatch):
     session = {"dr": dr, "jax": jax, "jnp": jnp, "np": np, "Path": Path}
     runner, wrong = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS), []
     for example in examples():
+        if example.name in EXTRAS and not importlib.util.find_spec(EXTRAS[example.name]):
+            continue
         example.globs = session
         runner.run(example, out=wrong.append, clear_globs=False)
     assert not wrong, "".join(wrong)

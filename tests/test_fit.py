@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid import sysid
 from diffrigid.sysid.free import Free
 
 NOISE = 3e-3  # [m]
@@ -111,3 +112,26 @@ def test_a_start_on_a_bound_is_pulled_off_it():
     assert np.isfinite(dr.interval(0, 1).unbounded(np.array([0.0, 1.0]))).all()
     with pytest.raises(ValueError, match="low < high"):
         dr.interval(1, 0)
+
+
+def test_starts_are_grouped_by_the_order_of_their_impacts(fit, tmp_path):
+    """In truth the first strikes the second, and that the third."""
+    assert all(order == (("d0-d1", "d1-d2"),) for order in fit.orders[: fit.agree])
+    for text in (repr(fit), fit._repr_html_()):
+        assert f"{fit.agree} of 8 starts: d0-d1, d1-d2" in text
+    assert dr.load_fit(fit.save(tmp_path / "fit.json")).orders == fit.orders
+
+
+def test_starts_that_miss_are_another_order():
+    """From far and without a width some starts stay at a miss. What is not struck does not move."""
+    free = {"restitution": dr.interval(0, 1), "d1.mass": dr.positive(), "d0.v": dr.real()}
+    fit = dr.fit(*discs(0.5, 1.0, (1.5, 0.0)), record(1), free=free, starts=8, seed=2, progress=False)
+    for (order,), (e, mass, *v) in zip(fit.orders, fit.starts.T, strict=False):
+        world, state = discs(1 / (1 + np.exp(-e)), np.exp(mass), v)
+        end = np.abs(np.asarray(dr.rollout(world, state, dt=1 / 60, steps=119).state.v[-1])).sum(1)
+        assert {f"d{k}" for k in range(3) if end[k] > 0} - {"d0"} == set("-".join(order).split("-")) - {"d0", ""}, order
+    groups = sysid.orders.alike(fit.orders)
+    assert len(groups) > 1 and groups[0][0] == 0
+    assert f"; {len(groups[1])} of 8: " in repr(fit)
+    axes = pytest.importorskip("matplotlib") and sysid.cost_figure(fit).axes[0]
+    assert [len(line.get_xdata()) for line in axes.lines] == [len(members) for members in groups]

@@ -144,9 +144,19 @@ def test_wrong_shapes(path, value, message):
 
 
 def test_units():
-    assert [paths.unit(p) for p in ("ball.mass", "ball.shape.radius", "air.linear", "restitution")] == [
+    assert [paths.unit(FLAT[0], p) for p in ("ball.mass", "ball.shape.radius", "air.linear", "restitution")] == [
         "kg",
         "m",
         "N s/m",
         "",
     ]
+
+
+def test_units_of_joints_are_those_of_an_axis_or_a_way():
+    along = {"lower": -1.0, "friction": 0.1, "speed": 0.5, "damping": 0.2}
+    bodies = {name: dr.Body(None, mass=1.0, inertia=1.0, x=(x, 0.0)) for name, x in (("a", 0.0), ("b", 1.0))}
+    joints = {"hinge": dr.Revolute("a", anchor_a=0.0, **along), "rail": dr.Prismatic("b", axis_b=(1.0, 0.0), **along)}
+    world, _ = dr.scene(bodies, joints=joints)
+    fields = (*along, "anchor_a")
+    assert [paths.unit(world, f"hinge.{f}") for f in fields] == ["rad", "N m", "rad/s", "N m s", "m"]
+    assert [paths.unit(world, f"rail.{f}") for f in fields] == ["m", "N", "m/s", "N s/m", "m"]

@@ -11,8 +11,7 @@ import pytest
 from motions import DOWN, HEIGHT, IMPACT, MASS, RADIUS, E, G, T, bounce, trajectory
 
 import diffrigid as dr
-from diffrigid.view.contacts import find_contacts
-from diffrigid.view.frames import energies
+from diffrigid.view.frames import contacts, energies
 
 
 def content(player):
@@ -105,7 +104,7 @@ def test_measured_columns_are_kept_with_what_is_missing():
 @pytest.mark.parametrize("spin", [0.0, 3.0])
 def test_an_impact_is_found_at_its_time_with_its_impulse(dim, spin):
     run = bounce(dim, spin=spin)
-    table = find_contacts(run, T)
+    table = contacts(run, T)
     (impact,) = table[table[:, 1] == 1]
     # The flight to it is drawn without gravity: late by g h^2 / 8 v at most
     assert impact[0] == pytest.approx(IMPACT, abs=G * (T[1] - T[0]) ** 2 / 8 / DOWN)
@@ -116,7 +115,7 @@ def test_an_impact_is_found_at_its_time_with_its_impulse(dim, spin):
 @pytest.mark.parametrize(("dim", "points"), [(2, 2), (3, 4)])
 def test_points_that_carry_a_body_carry_its_weight(dim, points):
     run = bounce(dim)
-    table = find_contacts(run, T)
+    table = contacts(run, T)
     first = table[(table[:, 1] == 0) & (table[:, 0] < T[1] / 2)]
     assert len(first) == points
     np.testing.assert_allclose(first[:, 2 + dim :].sum(0), G * (T[1] - T[0]) * np.eye(dim)[-1], atol=1e-6)
@@ -141,7 +140,7 @@ def test_impulse_between_two_bodies_is_found_at_corner_edge_and_round(dim):
         v0, v1 = np.array([along, 0 * along]), np.array([0 * along, along])
         still = np.zeros((2, *state.w.shape))
         run = trajectory(world, [0.0, h], [x0, x1], np.stack([state.q, state.q]), [v0, v1], still)
-        table = find_contacts(run, run.t)
+        table = contacts(run, run.t)
         assert table[:, 1].all() and abs(table[0, 0] - 0.0035) < 1e-4
         np.testing.assert_allclose(np.abs(table[:, 2 + dim :].sum(0)), along, atol=1e-6)
         np.testing.assert_allclose(table[:, 2].mean(), 0.0035, atol=1e-3)
@@ -179,8 +178,12 @@ def test_what_cannot_be_drawn_is_an_error_that_says_how():
         dr.play({"many": front})
     assert batch._repr_html_() is None and front._repr_html_() is None
     dr.play(jax.tree.map(lambda leaf: leaf[0], front))
-    with pytest.raises(ValueError, match="rollout"):
-        dr.play(run.state)
+    of_many = dr.replace(run, state=front.state)  # states as `rollout_batch` returns them
+    with pytest.raises(ValueError, match=r"leaf\[0\]"):
+        dr.play(of_many)
+    with pytest.raises(ValueError, match="`rollout_batch` pick a world"):
+        dr.play(front.state)
+    dr.play(dr.replace(of_many, state=jax.tree.map(lambda leaf: leaf[0], front.state)))
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda run: dr.play(run).height)(run)
     with pytest.raises(ValueError, match="one dimension"):

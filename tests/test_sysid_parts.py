@@ -13,8 +13,10 @@ from numpy.testing import assert_allclose
 import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.__main__ import main
+from diffrigid.impacts import order_of_impacts
 from diffrigid.scene_file import read_scene
 from diffrigid.sysid.diagnosis import doubts, normality, whiteness
+from diffrigid.sysid.orders import in_words
 from diffrigid.sysid.records import columns, read_csv
 from diffrigid.sysid.sensors import channel_of, difference, predict
 
@@ -224,6 +226,30 @@ def test_pieces_of_a_long_record_start_where_it_was_measured():
         assert_allclose(piece.state.v[0], (1.0, -1.0), atol=1e-9)
         assert_allclose(piece.state.w[0], 4.0, atol=1e-9)
         assert_allclose(piece.observations["cue.x"][0][[0, -1]], (piece.start, piece.start + 0.5))
+
+
+# ---- order of impacts
+
+
+def test_orders_of_impacts_in_words():
+    bounces, hit = ("b-floor",) * 3, ("a-b", "b-floor")
+    assert in_words(((bounces,),), 1) == "impacts: b-floor x 3"
+    assert in_words(((hit,), (hit,), ((),)), 4) == "impacts, 2 of 4 starts: a-b, b-floor; 1 of 4: none"
+    assert in_words((((),), ((),)), 2) == ""
+    two_records = ((hit, bounces), (hit, hit), (hit, bounces))
+    assert in_words(two_records, 3) == "impacts of record 1, 2 of 3 starts: b-floor x 3; 1 of 3: a-b, b-floor"
+    many = tuple((tuple(f"{k}-{n}" for n in range(10)),) for k in range(5))
+    assert in_words(many, 5).endswith("2-6, 2-7, and 2 more; 2 in other orders")
+
+
+def test_what_happens_at_one_time_is_listed_by_name():
+    """A ball falls on a corner of two planes, and two more strike each other at the same time, and then the planes."""
+    bodies = {name: dr.Body(dr.Disc(radius=0.1), mass=1.0, x=x, v=v) for name, x, v in (
+        ("b", (1.0, 1.0), (-1.0, -1.0)), ("a", (3.0, 5.0), (0.9, 0.0)), ("c", (5.0, 5.0), (-0.9, 0.0))
+    )}  # fmt: skip
+    walls = {"wall": dr.Static(dr.HalfSpace(normal=(1.0, 0.0))), "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))}
+    trajectory = dr.rollout(*dr.scene(bodies | walls, restitution=1.0), dt=1 / 60, steps=330)
+    assert order_of_impacts(trajectory) == ("b-floor", "b-wall", "a-c", "a-wall")
 
 
 # ---- losses and residuals

@@ -10,7 +10,8 @@ from diffrigid.sysid.losses import huber, squares, student
 from diffrigid.sysid.profile import profile, with_profiles
 from diffrigid.sysid.records import Record
 from diffrigid.sysid.result import Fit
-from diffrigid.sysid.segments import segments
+from diffrigid.sysid.sampling import sample
+from diffrigid.sysid.segments import fit_in_pieces, jumps, segments
 from diffrigid.sysid.sensors import Channel, Homography, Marker, Pinhole, Separation
 from diffrigid.sysid.setup import jacobian_matrix, make_problem, residual_vector, start_vector
 from diffrigid.sysid.summary import Parameter, load_fit
@@ -35,11 +36,13 @@ __all__ = [
     "expected_intervals",
     "first_order",
     "fit",
+    "fit_in_pieces",
     "from_jacobian",
     "huber",
     "inertia",
     "interval",
     "jacobian_matrix",
+    "jumps",
     "lbfgs",
     "load_fit",
     "make_problem",
@@ -51,6 +54,7 @@ __all__ = [
     "residual_figure",
     "residual_vector",
     "rotation",
+    "sample",
     "sandwich",
     "segments",
     "shares",

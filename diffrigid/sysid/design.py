@@ -12,9 +12,9 @@ from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
 from diffrigid.sysid.diagnosis import blind_directions, coordinates, infinite_where_blind
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.parameters import Slot, knows, make_slots, put, reference
+from diffrigid.sysid.parameters import Slot, make_slots, put, reference
 from diffrigid.sysid.records import Record
-from diffrigid.sysid.result import interval_of, unit_of
+from diffrigid.sysid.result import interval_of, references, unit_of
 from diffrigid.sysid.setup import Problem, first_numbers, linear_of, make_problem, make_starts, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.world import World
@@ -70,10 +70,7 @@ def blind_spots(
     """
     problem = make_problem(world, state, observations, free=free, noise=noise, observe=observe, dt=dt)
     linear = linear_of(problem, point_at(problem.groups, make_starts(problem, 1, 0)), 0, Squares(), False)
-    slots = (*problem.shared, *problem.own)
-    scenes = [scene_of(run) for run in problem.runs]
-    having = [next(s for s in scenes if all(knows(s, path) for path in slot.paths)) for slot in slots]
-    places = coordinates(slots, [np.asarray(reference(*pair)) for pair in zip(slots, having, strict=True)])
+    places = coordinates((*problem.shared, *problem.own), references(problem))
     return tuple(blind.words for blind in blind_directions(linear, places))
 
 
@@ -181,4 +178,4 @@ def _parameters(problem: Problem, record: int, linear: Linear) -> tuple[Paramete
 def _parameter(slot: Slot, z: np.ndarray, covariance: np.ndarray, problem: Problem, record: int) -> Parameter:
     about = reference(slot, scene_of(problem.runs[record]))
     value, low, high = interval_of(slot, z, covariance, about, 1.959964)
-    return Parameter(slot.name, value, low, high, unit_of(slot), "expected")
+    return Parameter(slot.name, value, low, high, unit_of(problem, slot), "expected")

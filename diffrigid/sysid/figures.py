@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid.sysid.diagnosis import correlations
+from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import Profile
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.table import number_names
@@ -35,10 +36,14 @@ def residual_figure(fit: Fit, record: int = 0) -> Any:
 
 
 def cost_figure(fit: Fit) -> Any:
-    """Cost at which each start ended, lowest first."""
+    """Cost at which each start ended, lowest first; a colour for each order of impacts."""
     figure, axes = _axes()
-    axes.semilogy(np.arange(1, len(fit.costs) + 1), np.where(np.isfinite(fit.costs), fit.costs, np.nan), "o")
+    for number, members in enumerate(alike(fit.orders)):
+        at = np.array(members)
+        axes.semilogy(at + 1, fit.costs[at], "o", label=f"order of impacts {number + 1}")
     axes.set(xlabel="start", ylabel="cost")
+    if len(alike(fit.orders)) > 1:
+        axes.legend(fontsize="small")
     return figure
 
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from diffrigid.convert import numbers
@@ -14,6 +15,7 @@ from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacob
 from diffrigid.sysid.free import Chart, Each, Free, Prior
 from diffrigid.sysid.levenberg import Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import split
 from diffrigid.sysid.records import check_mapping
 from diffrigid.sysid.result import Fit, describe
@@ -166,8 +168,10 @@ def finish(
     residuals = tuple(by_column(problem, point, best))
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, scenes)
     order = np.argsort(costs)
+    sorted_z = jax.tree.map(lambda leaf: leaf[..., order], point.z)
     summary = Summary(
         parameters=parameters, noise=_all_noise(problem), costs=costs[order],
+        orders=impact_orders(problem, sorted_z, int(np.isfinite(costs).sum())),
         agree=int((costs <= costs[best] + ALIKE + 1e-3 * costs[best]).sum()), notes=(*remarks, *notes), seed=seed,
         seconds=time.time() - began, versions=versions(),
     )  # fmt: skip

@@ -7,6 +7,7 @@ A kind of parameter is a frozen record with the verbs
     unbounded(reference)      the z whose value is the reference, pulled off its bounds
     draw(reference, random)   z of a random start
     at_bound(value)           true if a result lies on a bound
+    log_volume(z, reference)  log |d value / d z|: how much of the parameter a volume of z is
     scale(reference)          (k,) a change of z that is large: what the data cannot tell is measured by it
 
 `each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds what is known beforehand.
@@ -63,6 +64,11 @@ class Free:
             return self.unbounded(random.uniform(self.low, self.high, value.shape))
         return self.unbounded(value) + self.spread * self.scale(value) * random.standard_normal(value.size)
 
+    def log_volume(self, z: Array, reference: Any = None) -> Array:
+        if np.isfinite(self.high):
+            return (jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)).sum()
+        return jnp.zeros((), z.dtype) if np.isinf(self.low) else z.sum()
+
     def at_bound(self, value: np.ndarray) -> bool:
         if not np.isfinite(self.high):
             return False
@@ -96,6 +102,10 @@ class Chart:
 
     def draw(self, reference: np.ndarray, random: np.random.Generator) -> np.ndarray:
         return self.spread * random.standard_normal(self.size(np.shape(reference)))
+
+    def log_volume(self, z: Array, reference: Array) -> Array:
+        slopes = jax.jacfwd(self.map)(z, reference).reshape(-1, z.shape[0])
+        return 0.5 * jnp.linalg.slogdet(slopes.T @ slopes)[1]
 
     def at_bound(self, value: np.ndarray) -> bool:
         return False

@@ -65,8 +65,8 @@ class Progress(NamedTuple):
 
 def point_at(groups: Sequence[Group], z: Numbers) -> Point:
     """Residuals and Jacobians of all groups."""
-    pairs = [linearise(group.plan, z.of(group.members), group.data) for group in groups]
-    return Point(z, tuple(r for r, _ in pairs), tuple(j for _, j in pairs))
+    found = [linearise(group.plan, z.of(group.members), group.data) for group in groups]
+    return Point(z, tuple(r for r, _, _ in found), tuple(j for _, j, _ in found))
 
 
 @partial(jax.jit, static_argnames="loss")

@@ -20,12 +20,14 @@ from jax import Array
 from diffrigid import paths
 from diffrigid.convert import positive
 from diffrigid.devices import cut, devices, everywhere, join, over_devices, pieces_of
+from diffrigid.state import State
 from diffrigid.step import aligned, scan_steps
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
 from diffrigid.sysid.records import SAME, Run, Series
 from diffrigid.sysid.sensors import Part, difference
 
+LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are looked at
 QUICK = {"xla_cpu_use_fusion_emitters": False}  # half the time to compile; a quarter slower to run where large
 
 
@@ -171,8 +173,13 @@ def residuals(plan: Plan, z: Array, data: Data) -> Array:
 
     Rows of priors come last, shared among the records so that their squares sum to one prior.
     """
+    return _simulated(plan, z, data)[0]
+
+
+def _simulated(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
+    """Residuals, and the states (S+1, ..., B) that they come from, which lie where they were computed."""
     if len(devices()) == 1:
-        return _residuals(plan, z, data)
+        return _simulated_here(plan, z, data)
     lanes, (leaves, tree) = z.shape[1], jax.tree.flatten((z, data))
     own = [leaf is z or (leaf.ndim > 0 and leaf.shape[-1] == lanes > 1) for leaf in leaves]
     pieces = pieces_of(lanes, lanes)
@@ -181,12 +188,14 @@ def residuals(plan: Plan, z: Array, data: Data) -> Array:
 
     def share(parts, alike):
         mine, alike = iter(part[0] for part in parts), iter(alike)
-        return _residuals(plan, *jax.tree.unflatten(tree, [next(mine if many else alike) for many in own]))[None]
+        own_share = jax.tree.unflatten(tree, [next(mine if many else alike) for many in own])
+        return jax.tree.map(lambda leaf: leaf[None], _simulated_here(plan, *own_share))
 
-    return everywhere(join(over_devices(share, parts, alike), -1, lanes))
+    found, states = jax.tree.map(lambda leaf: join(leaf, -1, lanes), over_devices(share, parts, alike))
+    return everywhere(found), states
 
 
-def _residuals(plan: Plan, z: Array, data: Data) -> Array:
+def _simulated_here(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
     lanes = z.shape[1]
     scene = _lanes(plan.slots, data.scene, z)
     world, _ = paths.write(scene.world, scene.state, "contact.width", data.width)
@@ -201,7 +210,7 @@ def _residuals(plan: Plan, z: Array, data: Data) -> Array:
             seen = jax.tree.map(lambda leaf, index=data.rows[name]: _pick(leaf, index), states)
         away = difference(channel, seen, data.measured[name]) * data.weights[name]
         rows.append(away.reshape(-1, lanes))
-    return jnp.concatenate([*rows, *_prior_rows(plan, data.scene, z)])
+    return jnp.concatenate([*rows, *_prior_rows(plan, data.scene, z)]), states
 
 
 def _lanes(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
@@ -230,9 +239,10 @@ def _prior_rows(plan: Plan, scene: Scene, z: Array) -> list[Array]:
     return rows
 
 
-@partial(jax.jit, static_argnames="plan", compiler_options=QUICK)
-def linearise(plan: Plan, z: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals (m, R, S) and their Jacobian (m, n, R, S) at z (n, R, S), R records and S starts, by forward mode.
+def linearised(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
+    """Residuals (m, R, S), their Jacobian (m, n, R, S), and the motions of the first few records and starts.
+
+    At z (n, R, S), R records and S starts, by forward mode. Motions are states (steps + 1, ..., R, S).
 
     The n directions lie on the last axis too, each with the state beside it: it costs some more to run than to share
     the state among them, and half as much to trace.
@@ -241,8 +251,10 @@ def linearise(plan: Plan, z: Array, data: Data) -> tuple[Array, Array]:
     wide = jnp.broadcast_to(z[:, None], (n, n, R, S)).reshape(n, -1)
     unit = jnp.broadcast_to(jnp.eye(n, dtype=z.dtype)[:, :, None, None], (n, n, R, S)).reshape(n, -1)
     spread_out = _spread(data, n, S)
-    value, slope = jax.jvp(lambda z: residuals(plan, z, spread_out), (wide,), (unit,))
-    return value.reshape(-1, n, R, S)[:, 0], slope.reshape(-1, n, R, S)
+    value, slope, states = jax.jvp(lambda z: _simulated(plan, z, spread_out), (wide,), (unit,), has_aux=True)
+    few = (..., 0, *map(slice, LOOKED_AT))
+    some = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], n, R, S)[few], states)
+    return value.reshape(-1, n, R, S)[:, 0], slope.reshape(-1, n, R, S), everywhere(some)
 
 
 def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
@@ -251,6 +263,7 @@ def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
     return residuals(plan, z.reshape(n, -1), _spread(data, 1, S)).reshape(-1, R, S)
 
 
+linearise = jax.jit(linearised, static_argnames="plan", compiler_options=QUICK)
 evaluate = jax.jit(residuals_of, static_argnames="plan", compiler_options=QUICK)
 
 

@@ -17,9 +17,19 @@ from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covar
 from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import best_by_record, levenberg
-from diffrigid.sysid.parameters import Scene, Slot, knows, reference
+from diffrigid.sysid.orders import Orders
+from diffrigid.sysid.parameters import Scene, Slot, reference
 from diffrigid.sysid.records import runs, same_data
-from diffrigid.sysid.setup import Problem, by_column, make_problem, make_starts, reach_of, scene_of, with_noise
+from diffrigid.sysid.setup import (
+    Problem,
+    by_column,
+    make_problem,
+    make_starts,
+    reach_of,
+    scene_having,
+    scene_of,
+    with_noise,
+)
 from diffrigid.sysid.summary import Parameter, Summary
 from diffrigid.sysid.table import html_table, text_table
 from diffrigid.world import World
@@ -65,6 +75,11 @@ class Fit:
     @property
     def agree(self) -> int:
         return self.summary.agree
+
+    @property
+    def orders(self) -> Orders:
+        """Of each start, the best first, and of each of the first three records, the pairs that strike, in order."""
+        return self.summary.orders
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -185,7 +200,7 @@ def describe(
     residuals: tuple[dict[str, np.ndarray], ...], scenes: tuple[Scene, ...],
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """The parameters with intervals, and the notes under the table."""
-    places = coordinates((*problem.shared, *problem.own), _references(problem))
+    places = coordinates((*problem.shared, *problem.own), references(problem))
     blind = blind_directions(linear, places)
     quantile = student_quantile(uncertainty.freedom)
     covariance = infinite_where_blind(uncertainty.covariance, blind, linear.shared)
@@ -208,12 +223,9 @@ def describe(
     return tuple(parameters), tuple(notes)
 
 
-def _references(problem: Problem) -> list[np.ndarray]:
-    scenes = [scene_of(run) for run in problem.runs]
-    return [
-        np.asarray(reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths))))
-        for slot in (*problem.shared, *problem.own)
-    ]
+def references(problem: Problem) -> list[np.ndarray]:
+    """Value of each parameter in the scene of the first record that has it."""
+    return [np.asarray(reference(slot, scene_having(problem, slot))) for slot in (*problem.shared, *problem.own)]
 
 
 def _pieces(slots: tuple[Slot, ...], z: np.ndarray, covariance: np.ndarray):
@@ -225,13 +237,12 @@ def _pieces(slots: tuple[Slot, ...], z: np.ndarray, covariance: np.ndarray):
 
 
 def _shared_parameter(problem: Problem, slot: Slot, z, covariance, quantile: float, blind) -> Parameter:
-    scenes = (scene_of(run) for run in problem.runs)
-    about = reference(slot, next(s for s in scenes if all(knows(s, path) for path in slot.paths)))
+    about = reference(slot, scene_having(problem, slot))
     value, low, high = interval_of(slot, z, covariance, about, quantile)
     note = "at its bound" if slot.kind.at_bound(value) else ""
     if any(slot.name in b.names for b in blind):
         note = "not determined, see below"
-    return Parameter(slot.name, value, low, high, unit_of(slot), note)
+    return Parameter(slot.name, value, low, high, unit_of(problem, slot), note)
 
 
 def _own_parameters(problem: Problem, own: np.ndarray, blocks: list[np.ndarray], quantile: float, blind):
@@ -246,7 +257,7 @@ def _own_parameters(problem: Problem, own: np.ndarray, blocks: list[np.ndarray],
         note = "at its bound" if slot.kind.at_bound(value) else ""
         if any(slot.name in b.names for b in blind):
             note = "not determined, see below"
-        yield Parameter(slot.name, value, low, high, unit_of(slot), note, records)
+        yield Parameter(slot.name, value, low, high, unit_of(problem, slot), note, records)
         first += slot.size
 
 
@@ -266,9 +277,10 @@ def interval_of(slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, q
     return value, value - half, value + half
 
 
-def unit_of(slot: Slot) -> str:
+def unit_of(problem: Problem, slot: Slot) -> str:
     """SI unit; that of a column's bias or of what it observes is the user's."""
-    return "s" if slot.paths[0].split(".")[-1] == "clock" else unit(slot.paths[0])
+    path = slot.paths[0]
+    return "s" if path.split(".")[-1] == "clock" else unit(scene_having(problem, slot).world, path)
 
 
 def _together(covariance: np.ndarray, places, blind) -> list[str]:

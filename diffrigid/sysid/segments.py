@@ -2,27 +2,36 @@
 
 Over a short time the motion depends on its start as a straight line does; over many impacts it does not, and a fit from
 a poor start is lost. What all pieces share is found first, with `each` for their states; then a fit of the whole record
-with growing `windows` starts from there:
+with growing `windows` starts from there, and ends in one motion without jumps. `fit_in_pieces` does both, or by hand:
 
     pieces = segments(world, state, observations, 8)
     own = {"ball.x": each(real()), "ball.v": each(real())}
     first = fit(world, state, pieces, free={"restitution": interval(0, 1), **own})
+    jumps(first)  # how far the end of a piece is from where the next begins
     whole = fit(first.world, first.state, observations, free=..., windows=(0.5, 1, 2, inf))
+
+Source: Bock 1981, multiple shooting for parameter identification.
 """
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from diffrigid import paths
-from diffrigid.state import State
-from diffrigid.step import at_least_one
+from diffrigid.state import State, rotations
+from diffrigid.step import at_least_one, rollout
+from diffrigid.sysid.fit import fit
+from diffrigid.sysid.free import Each, each, real, rotation
 from diffrigid.sysid.records import Record, Series, columns
+from diffrigid.sysid.result import Fit
 from diffrigid.sysid.sensors import Part
 from diffrigid.world import World, check
 
 FRAMES = 5  # rows of a column that a guess of its start is made from
+LOST = 1.5  # times the noise in pieces: residuals of the whole record beyond which it is said to be lost
 
 
 def segments(world: World, state: State, observations: Any, count: int) -> list[Record]:
@@ -68,3 +77,105 @@ def _guessed(world: World, state: State, series: Series, start: float) -> State:
     for name, number in zip(names[field], (value.reshape(shape), slope), strict=True):
         _, state = paths.write(world, state, f"{body}.{name}", jnp.asarray(number, state.x.dtype))
     return state
+
+
+def fit_in_pieces(
+    world: World, state: State, observations: Any, count: int, *, free: Mapping[Any, Any], starts: int = 1,
+    **options: Any,
+) -> Fit:  # fmt: skip
+    """Fit a long record through `count` pieces of it: first each with a state of its own, then all as one motion.
+
+    The result is that of the whole record from its start: one motion. Its first note says how far the ends of the
+    pieces were from where the next began, and another if the whole motion does not fit as its pieces did.
+
+    Args:
+        observations: of one record, its columns named for what they observe: "ball.x" of every body, which then has a
+            position and a velocity in each piece; "ball.angle" or "ball.q" likewise. Spins that are not measured begin
+            in each piece as in `state`.
+        free: of the whole record, the initial state among it.
+        starts: of the fit in pieces; the whole record is fitted from the best.
+        options: others of `fit`, but `windows`, which grow with the pieces.
+    """
+    pieces = segments(world, state, observations, count)
+    shared = {key: kind for key, kind in free.items() if not _initial(world, key)}
+    first = fit(world, state, pieces, free=shared | _own_states(world, observations), starts=starts, **options)
+    ends = [run.start - first.problem.runs[0].start for run in first.problem.runs[2::2]]
+    whole = fit(world, state, observations, free=free, windows=(*ends, np.inf), resume=first, **options)
+    notes = (_apart(first, count), *_lost(first, whole), *whole.notes)
+    return replace(whole, summary=replace(whole.summary, notes=notes))
+
+
+def jumps(fit: Fit) -> dict[str, np.ndarray]:
+    """How far the next piece begins from where each ends.
+
+    Args:
+        fit: of the pieces that `segments` made.
+
+    Returns:
+        By "ball.x" [m], "ball.v" [m/s], "ball.w" [rad/s], (pieces - 1, D or A) in world axes; and by "ball.angle" or
+        "ball.q" [rad], as a rotation vector in axes of the body.
+    """
+    spans, so = np.diff([run.start for run in fit.problem.runs]), rotations(fit.world.dim)
+    steps = max(int(np.ceil(spans.max() / np.diff(fit.t).min())), 1)
+    turned = "angle" if fit.world.dim == 2 else "q"
+    out: dict[str, list[np.ndarray]] = {}
+    for scene, later, span in zip(fit.scenes[:-1], fit.scenes[1:], spans, strict=True):
+        end, next_ = rollout(scene.world, scene.state, dt=span / steps, steps=steps).state, later.state
+        for k, name in enumerate(fit.world.names):
+            apart = {field: getattr(next_, field)[k] - getattr(end, field)[-1, k] for field in ("x", "v", "w")}
+            apart[turned] = so.log(so.difference(end.q[-1, k], next_.q[k]))
+            for field, value in apart.items():
+                out.setdefault(f"{name}.{field}", []).append(np.asarray(value, float))
+    return {name: np.stack(rows) for name, rows in out.items()}
+
+
+def _initial(world: World, key: Any) -> bool:
+    """True for a path, or a tuple of paths, into the initial state."""
+    names = [key] if isinstance(key, str) else key
+    known = paths._catalogue(world)
+    return any(place.chain[0] == 1 for name in names for place in known.get(name, []))
+
+
+def _own_states(world: World, observations: Any) -> dict[str, Each]:
+    """What each piece has of its own: pose and velocity of what is measured.
+
+    Raises:
+        ValueError: a body whose position is no column.
+    """
+    seen: dict[str, list[str]] = {}
+    for channel in columns(world, observations, {})[1].values():
+        if isinstance(channel.observer, Part):
+            seen.setdefault(channel.observer.field, []).append(world.names[channel.observer.body])
+    if missing := [name for name in world.names if name not in seen.get("x", ())]:
+        raise ValueError(f"fit_in_pieces: no column {missing[0] + '.x'!r}, where each piece of it begins: use windows=")
+    out = {f"{name}.{field}": each(real()) for name in world.names for field in ("x", "v")}
+    out |= {f"{name}.{field}": each(real()) for name in seen.get("angle", ()) for field in ("angle", "w")}
+    out |= {f"{name}.q": each(rotation()) for name in seen.get("q", ())}
+    return out | {f"{name}.w": each(real()) for name in seen.get("q", ())}
+
+
+def _apart(first: Fit, count: int) -> str:
+    """The largest jumps in words."""
+    found = jumps(first)
+    largest = []
+    for field, unit in (("x", "m"), ("v", "m/s")):
+        sizes = {name: np.linalg.norm(rows, axis=1).max() for name, rows in found.items() if name.endswith(f".{field}")}
+        name = max(sizes, key=lambda name: sizes[name])
+        largest.append(f"{sizes[name]:.2g} {unit} ({name})")
+    return f"fitted in {count} pieces first, which jumped by up to {' and '.join(largest)}; then as one motion"
+
+
+def _lost(first: Fit, whole: Fit) -> list[str]:
+    """Columns of which the whole motion leaves larger residuals than the pieces."""
+    sizes = {name: (_rms(whole, name), _rms(first, name)) for name in whole.noise}
+    worst = max(sizes, key=lambda name: sizes[name][0] / sizes[name][1])
+    ratio = sizes[worst][0] / sizes[worst][1]
+    if ratio < LOST:
+        return []
+    return [f"as one motion residuals of {worst} are {ratio:.2g} times those in pieces: it is lost, or the model wrong"]
+
+
+def _rms(fit: Fit, name: str) -> float:
+    """Root mean square of the residuals of a column, in its unit."""
+    values = [fit.noise[name] * record[name].ravel() for record in fit.residuals if name in record]
+    return max(float(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), 1e-300)

@@ -183,9 +183,14 @@ def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
 
 
 def _value(problem: Problem, slot: Slot) -> Any:
-    """Reference of a shared parameter: that of the first record that has it."""
+    """Reference of a parameter: that of the first record that has it."""
+    return reference(slot, scene_having(problem, slot))
+
+
+def scene_having(problem: Problem, slot: Slot) -> Scene:
+    """The scene of the first record that has a parameter."""
     scenes = (scene_of(run) for run in problem.runs)
-    return reference(slot, next(scene for scene in scenes if all(knows(scene, path) for path in slot.paths)))
+    return next(scene for scene in scenes if all(knows(scene, path) for path in slot.paths))
 
 
 def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -234,10 +239,16 @@ def fitted_scenes(problem: Problem, shared: np.ndarray, own: np.ndarray) -> list
     """The scene of every record with the parameters z (a,), (b, R) put in."""
     out: list[Any] = [None] * len(problem.runs)
     for group in problem.groups:
-        for k in group.members:
-            z = jnp.asarray(np.concatenate([shared, own[:, k]]), problem.runs[k].state.x.dtype)
-            out[k] = _put(group.plan.slots, scene_of(problem.runs[k]), z)
+        for k, member in enumerate(group.members):
+            out[member] = fitted_scene(problem, group, k, shared, own)
     return out
+
+
+def fitted_scene(problem: Problem, group: Group, k: int, shared: np.ndarray, own: np.ndarray) -> Scene:
+    """Of record k of a group."""
+    run = problem.runs[group.members[k]]
+    z = jnp.asarray(np.concatenate([shared, own[:, group.members[k]]]), run.state.x.dtype)
+    return _put(group.plan.slots, scene_of(run), z)
 
 
 _put = jax.jit(put, static_argnames="slots")

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.table import html_table, text_table
 
 
@@ -34,6 +35,7 @@ class Summary:
     noise: dict[str, float]  # standard deviation of each column's residuals, in its unit
     costs: np.ndarray  # (starts,) the loss of the residuals, lowest first; inf: diverged
     agree: int  # starts that ended at the best cost
+    orders: Orders  # of each start, the best first, and of the first records: which pairs strike, in order of time
     notes: tuple[str, ...]  # what the data cannot tell, and why not to believe the intervals
     seed: int
     seconds: float
@@ -76,9 +78,11 @@ def load_fit(path: str | Path) -> Summary:
             Parameter(**{**p, **{key: np.asarray(p[key], float) for key in ("value", "low", "high")}})
             for p in data.pop("parameters")
         )
+        orders = tuple(tuple(tuple(pairs) for pairs in start) for start in data.pop("orders"))
         return Summary(
-            parameters=parameters, costs=np.asarray(data.pop("costs"), float), notes=tuple(data.pop("notes")), **data
-        )
+            parameters=parameters, costs=np.asarray(data.pop("costs"), float), notes=tuple(data.pop("notes")),
+            orders=orders, **data,
+        )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{path} is not a saved fit: {error}") from error
 

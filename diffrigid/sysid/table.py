@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from diffrigid.sysid.orders import in_words
+
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
 SHOWN = 3  # records whose own numbers are in the table
 
@@ -41,8 +43,13 @@ def _digits(value: float, low: float, high: float) -> int:
     return int(np.clip(np.ceil(np.log10(size / width)) + 2, 3, 12))
 
 
-def summary(fit: Any) -> str:
-    """One line on the starts, the noise and the time."""
+def below(fit: Any) -> list[str]:
+    """Lines under the table: on the starts, the noise and the time; and on the order of impacts."""
+    impacts = in_words(fit.orders, len(fit.costs))
+    return [_starts(fit), *([impacts] if impacts else [])]
+
+
+def _starts(fit: Any) -> str:
     noise = ", ".join(f"{name} {value:.3g}" for name, value in fit.noise.items())
     parts = [f"{fit.agree} of {len(fit.costs)} starts agree{_others(fit)}"]
     parts += [f"noise: {noise}"] if len(fit.noise) <= 6 else []
@@ -63,11 +70,16 @@ def _others(fit: Any) -> str:
 
 def text_table(fit: Any) -> str:
     """The table in plain text, with the notes under it."""
-    table = [HEADER, *rows(fit)]
-    widths = [max(len(row[i]) for row in table) for i in range(len(HEADER))]
+    return "\n".join([*laid_out(HEADER, rows(fit)), *below(fit), *(f"! {note}" for note in fit.notes)])
+
+
+def laid_out(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table, in columns, between rules."""
+    table = [header, *rows]
+    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
     rule = "-" * max(map(len, lines))
-    return "\n".join([lines[0], rule, *lines[1:], rule, summary(fit), *(f"! {note}" for note in fit.notes)])
+    return [lines[0], rule, *lines[1:], rule]
 
 
 def html_table(fit: Any) -> str:
@@ -75,5 +87,5 @@ def html_table(fit: Any) -> str:
     head = "".join(f"<th>{cell}</th>" for cell in HEADER)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows(fit))
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in fit.notes)
-    below = f"<p>{html.escape(summary(fit))}</p>" + (f"<ul>{notes}</ul>" if notes else "")
-    return f"<table><tr>{head}</tr>{body}</table>{below}"
+    lines = "".join(f"<p>{html.escape(line)}</p>" for line in below(fit))
+    return f"<table><tr>{head}</tr>{body}</table>{lines}" + (f"<ul>{notes}</ul>" if notes else "")

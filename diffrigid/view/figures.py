@@ -12,9 +12,9 @@ import numpy as np
 from diffrigid import state as of_state
 from diffrigid.pytree import align
 from diffrigid.step import Trajectory
+from diffrigid.touch import rotated
 from diffrigid.view.frames import checked, energies
 from diffrigid.view.outline import outline
-from diffrigid.view.touch import rotated
 
 
 def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:

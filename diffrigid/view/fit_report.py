@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from diffrigid.impacts import find_contacts
 from diffrigid.step import Trajectory
+from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import Profile, profile, with_profiles
 from diffrigid.sysid.records import Series
 from diffrigid.sysid.sensors import Part
-from diffrigid.sysid.table import HEADER, SHOWN, number_names, rows, summary
-from diffrigid.view.contacts import find_contacts
+from diffrigid.sysid.table import HEADER, SHOWN, below, number_names, rows
 from diffrigid.view.play import Player, play
 from diffrigid.view.report import Section, chart, matrix, write_report
 from diffrigid.view.report import Series as Curve
@@ -37,7 +38,7 @@ def _numbers(fit: Any) -> Section:
         title="What was found",
         table=rows(fit),
         header=(*HEADER[:-1], "remark"),
-        paragraphs=[summary(fit.summary) + "."],
+        paragraphs=[line + "." for line in below(fit.summary)],
     )
 
 
@@ -100,8 +101,8 @@ def _residuals(fit: Any, motions: Sequence[Trajectory]) -> Section:
 
 def impacts(motion: Trajectory) -> np.ndarray:
     """Times [s] of the impacts of a motion."""
-    table = find_contacts(motion, np.asarray(motion.t, float))
-    return np.unique(np.round(table[table[:, 1] == 1, 0], 6))
+    found = find_contacts(motion, np.zeros(0))
+    return np.unique(np.round(found.t[found.impact], 6))
 
 
 def residual_chart(fit: Any, record: int, series: Series, events: np.ndarray) -> str:
@@ -134,10 +135,13 @@ def _search(fit: Any, found: Sequence[Profile]) -> Section:
 
 
 def _costs(fit: Any) -> str:
-    """Where every start ended, the lowest first."""
-    over = np.where(np.isfinite(fit.costs), fit.costs, np.nan) / max(fit.costs[0], 1e-300)
-    curve = Curve(np.arange(1.0, 1 + len(over)), np.round(np.log10(over), 3), points=True)
-    return chart("Cost of each start", "start", "log10 of cost / lowest", [curve], margin=0.02)
+    """Where every start ended, the lowest first, in colours by the order of impacts."""
+    over = np.round(np.log10(fit.costs / max(fit.costs[0], 1e-300)), 3)
+    groups = [np.array(members) for members in alike(fit.orders)]
+    groups = [*groups[:2], np.concatenate(groups[2:])] if len(groups) > 2 else groups
+    names = ("order of the best", "another", "others") if len(groups) > 1 else ("",)
+    curves = [Curve(at + 1.0, over[at], name, k, True) for k, (at, name) in enumerate(zip(groups, names, strict=False))]
+    return chart("Cost of each start", "start", "log10 of cost / lowest", curves, margin=0.02)
 
 
 def profile_chart(found: Profile) -> str:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from diffrigid.forces import Gravity, SpringDamper
+from diffrigid.impacts import find_contacts
 from diffrigid.joints import Distance
 from diffrigid.pytree import align, batch_rank
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Profile, Shape, Sphere, with_topology
@@ -19,8 +20,7 @@ from diffrigid.state import State, kinetic_energy
 from diffrigid.step import Trajectory
 from diffrigid.sysid.records import columns
 from diffrigid.sysid.sensors import Part
-from diffrigid.view.contacts import find_contacts
-from diffrigid.view.touch import rotated
+from diffrigid.touch import rotated
 from diffrigid.world import World
 
 LEVELS = 65534  # of a packed number; 65535 is NaN
@@ -32,6 +32,11 @@ def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
     Raises:
         ValueError: something else, traced, or a batch.
     """
+    if isinstance(trajectory, State):
+        raise ValueError(
+            f"{name} is a State: expected what `rollout` returns; of states of `rollout_batch` pick a world, "
+            "Trajectory(t=t, state=jax.tree.map(lambda leaf: leaf[0], states), world=world)"
+        )
     if not isinstance(trajectory, Trajectory):
         raise ValueError(f"{name} is a {type(trajectory).__name__}: expected what `rollout` returns, or a dict of them")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trajectory)):
@@ -42,9 +47,11 @@ def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
             f"pick one with jax.tree.map(lambda leaf: leaf[0], {name})"
         )
     if np.ndim(trajectory.state.x) != 3 or batch_rank(trajectory.world):
+        shape = np.shape(trajectory.state.x)
+        first = "0" if len(shape) == 4 and len(trajectory.t) == shape[1] != shape[0] else "..., 0"
         raise ValueError(
-            f"{name}.state.x has shape {np.shape(trajectory.state.x)}, expected (T+1, N, D), and {name}.world without "
-            f"a batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[..., 0], {name}.state)), "
+            f"{name}.state.x has shape {shape}, expected (T+1, N, D), and {name}.world without "
+            f"a batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[{first}], {name}.state)), "
             "and likewise in the leaves of the world that have the batch axis"
         )
     return trajectory
@@ -80,7 +87,7 @@ def record(trajectory: Trajectory, name: str, data: Mapping[str, Any] | None, fr
     world, t = trajectory.world, np.asarray(trajectory.t, float)
     kept = np.unique(np.rint(np.linspace(0, len(t) - 1, min(len(t), frames))).astype(int))
     some = jax.tree.map(lambda leaf: np.asarray(leaf, float)[kept], trajectory.state)
-    table, marks = poses(trajectory)[kept], find_contacts(trajectory, t[kept])
+    table, marks = poses(trajectory)[kept], contacts(trajectory, t[kept])
     return {
         "name": name,
         "bodies": list(world.names),
@@ -100,6 +107,12 @@ def poses(trajectory: Trajectory) -> np.ndarray:
     x, q, v, w = (np.asarray(getattr(trajectory.state, name), float) for name in "xqvw")
     turn = _turns(np.asarray(trajectory.t, float), q, w) if x.shape[2] == 2 else _near(q)
     return np.concatenate([x, turn, v], axis=2).reshape(len(x), -1)
+
+
+def contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
+    """Rows by time: t [s], 1 for an impact or 0 for rest, point (D) [m], impulse (D) [N s] on one that moves."""
+    found = find_contacts(trajectory, t_drawn)
+    return np.column_stack([found.t, found.impact, found.point, found.impulse])
 
 
 def _turns(t: np.ndarray, q: np.ndarray, w: np.ndarray) -> np.ndarray:

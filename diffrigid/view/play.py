@@ -90,7 +90,7 @@ def play(
 
     Returns:
         A `Player`: HTML by itself in a notebook, a file by `.save(path)`. Numbers of a column are rounded to 1/131068
-        of what they span. Contacts are found as `contacts` says.
+        of what they span. Contacts are found as `diffrigid.impacts` says.
 
     Raises:
         ValueError: a batch of trajectories, dimensions that differ, unknown columns or names.

@@ -7,7 +7,8 @@ A trajectory stores states, not impulses, so they are inferred, one interval bet
     impulses       the smallest that, at these points and in the joints, explain the changes of momentum and angular
                    momentum beyond what the forces do in the interval (least norm: where points share a load, equally)
 
-Forces by `controls`, which a trajectory does not store, are taken for contact. Exact for a body with one contact.
+What touches a `Profile` is not found. Forces by `controls`, which a trajectory does not store, are taken for contact.
+Exact for a body with one contact.
 """
 
 from typing import Any, NamedTuple
@@ -21,12 +22,23 @@ from diffrigid.pytree import align, replace
 from diffrigid.shapes import HalfSpace, Profile, edges, radius, vertices
 from diffrigid.state import momentum, spin
 from diffrigid.step import Trajectory
-from diffrigid.view.touch import Side, gaps, rotated
+from diffrigid.touch import Side, gaps, rotated
 from diffrigid.world import World
 
 SLOP = 2e-3  # of the smaller size: what counts as touching
 WORK = 4_000_000  # pairs times intervals beyond which not all stored times are looked at
 ROUGH = 5.0  # an impulse that exceeds what the forces do in an interval by this factor is an impact
+
+
+class Meetings(NamedTuple):
+    """Contacts of a trajectory, in order of time; M of them. Colliders are numbered as in `World`."""
+
+    t: np.ndarray  # (M,) [s]
+    impact: np.ndarray  # (M,) bool: an impact, or rest
+    a: np.ndarray  # (M,) colliders
+    b: np.ndarray
+    point: np.ndarray  # (M, D) [m]
+    impulse: np.ndarray  # (M, D) [N s] on one that moves
 
 
 class Touch(NamedTuple):
@@ -50,8 +62,8 @@ class Motion(NamedTuple):
     w: np.ndarray  # (T+1, N + S, A)
 
 
-def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
-    """Rows by time: t [s], 1 for an impact or 0 for rest, point (D) [m], impulse (D) [N s] on one that moves.
+def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> Meetings:
+    """Impacts, and contacts at rest.
 
     Args:
         t_drawn: (F,) [s] times that are drawn; resting contacts are given only for intervals that begin then.
@@ -63,7 +75,8 @@ def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
     found = [_touches(world, group, motion, dp, dL, push) for group in groups]
     touch = Touch(*(np.concatenate(parts) for parts in zip(*found, strict=True))) if found else None
     if touch is None or not len(touch.s):
-        return np.zeros((0, 2 + 2 * dim))
+        none = np.zeros(0, int)
+        return Meetings(np.zeros(0), none > 0, none, none, np.zeros((0, dim)), np.zeros((0, dim)))
     impulse = _impulses(world, motion, touch, dp, dL)
     impulse = np.where(touch.a[:, None] < len(world.names), impulse, -impulse)
     size, ends = np.linalg.norm(impulse, axis=1), np.stack([touch.a, touch.b], axis=1)
@@ -72,8 +85,22 @@ def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
     impact = touch.new | rough
     drawn = np.isin(touch.interval, np.searchsorted(motion.t, t_drawn - 1e-9 * motion.t[-1]))
     kept = (size > 1e-6 * size.max()) & (impact | drawn)
-    table = np.column_stack([motion.t[touch.interval] + touch.s, impact, touch.point, impulse])[kept]
-    return table[np.argsort(table[:, 0], kind="stable")]
+    t = motion.t[touch.interval] + touch.s
+    kept = np.flatnonzero(kept)[np.argsort(t[kept], kind="stable")]
+    return Meetings(t[kept], impact[kept], touch.a[kept], touch.b[kept], touch.point[kept], impulse[kept])
+
+
+def order_of_impacts(trajectory: Trajectory) -> tuple[str, ...]:
+    """Which pairs strike each other, one after the other: ("cue-ball", "ball-wall").
+
+    Several points of one pair at a time are one impact. Those of different pairs that are closer in time than a
+    hundredth of a step count as simultaneous, and are listed by name, so that rounding does not tell them apart.
+    """
+    found, names = find_contacts(trajectory, np.zeros(0)), trajectory.world.names + trajectory.world.static_names
+    near = 0.01 * float(np.median(np.diff(trajectory.t)))
+    whole = np.cumsum(np.diff(found.t[found.impact], prepend=0.0) > near)  # times that are near share a number
+    pairs = [f"{names[a]}-{names[b]}" for a, b in zip(found.a[found.impact], found.b[found.impact], strict=True)]
+    return tuple(pair for _, pair in sorted(set(zip(whole.tolist(), pairs, strict=True))))
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:

@@ -1,0 +1,89 @@
+"""In which order bodies strike each other at the end of each start: what it takes to have happened.
+
+A different order is another explanation of the same record. Costs alone do not tell one from a search that came to an
+end too early: between two orders the cost has a kink, or a jump, that no gradient crosses.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from diffrigid.impacts import order_of_impacts
+from diffrigid.step import Trajectory
+from diffrigid.sysid.levenberg import Numbers
+from diffrigid.sysid.problem import LOOKED_AT, linearise
+from diffrigid.sysid.setup import Problem, fitted_scene
+
+NAMED, LISTED = 3, 8  # orders that are written out, and pairs of each
+
+Orders = tuple[tuple[tuple[str, ...], ...], ...]
+
+
+def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
+    """Of the first `count` starts z, of each of the first few records, the pairs that strike, in order of time.
+
+    At the steps of the fit: what is compiled already gives the motions.
+    """
+    records, starts = min(LOOKED_AT[0], len(problem.runs)), min(LOOKED_AT[1], count)
+    shared, own = np.asarray(z.shared, float), np.asarray(z.own, float)
+    found: dict[tuple[int, int], tuple[str, ...]] = {}
+    for group in problem.groups:
+        chosen = [k for k, member in enumerate(group.members) if member < records]
+        if not chosen:
+            continue
+        states = jax.tree.map(np.asarray, linearise(group.plan, z.of(group.members), group.data)[2])
+        for k in chosen:
+            run, lengths = problem.runs[group.members[k]], np.asarray(group.data.lengths, float)
+            t = np.concatenate([[0.0], np.cumsum(lengths[:, k if lengths.shape[1] > 1 else 0])])
+            end = max(series.t[-1] for series in run.series) - run.start
+            t = t[t <= end + 1e-9]  # shorter records are padded
+            for start in range(starts):
+                scene = fitted_scene(problem, group, k, shared[:, start], own[..., start])
+                lane = (slice(len(t)), ..., k, start)
+                state = jax.tree.map(lambda leaf, lane=lane: leaf[lane], states)
+                motion = Trajectory(t=t, state=state, world=scene.world)
+                found[start, group.members[k]] = order_of_impacts(motion)
+    return tuple(tuple(found[start, record] for record in range(records)) for start in range(starts))
+
+
+def alike(orders: Orders) -> list[tuple[int, ...]]:
+    """Which starts have the same order in all records, the group of the best start first."""
+    groups: dict[tuple[tuple[str, ...], ...], list[int]] = {}
+    for start, order in enumerate(orders):
+        groups.setdefault(order, []).append(start)
+    return [tuple(members) for members in groups.values()]
+
+
+def in_words(orders: Orders, starts: int) -> str:
+    """One line, "5 of 8 starts: cue-ball, ball-wall; 3 of 8: cue-wall"; "" where nothing strikes anything.
+
+    Of several records, the first in which the starts differ.
+    """
+    groups = alike(orders)
+    if not any(any(order) for order in orders):
+        return ""
+    kinds = [orders[members[0]] for members in groups]
+    record = next((k for k in range(len(kinds[0])) if len({order[k] for order in kinds}) > 1), 0)
+    where = f" of record {record}" if len(kinds[0]) > 1 else ""
+    if starts == 1:
+        return f"impacts{where}: {_listed(kinds[0][record])}"
+    parts = [
+        f"{len(members)} of {starts}{' starts' if not n else ''}: {_listed(order[record])}"
+        for n, (members, order) in enumerate(zip(groups[:NAMED], kinds, strict=False))
+    ]
+    others = sum(map(len, groups[NAMED:]))
+    return f"impacts{where}, " + "; ".join([*parts, *([f"{others} in other orders"] if others else [])])
+
+
+def _listed(order: Sequence[str]) -> str:
+    """Pairs, those that follow each other alike put together."""
+    runs: list[list] = []
+    for pair in order:
+        if runs and runs[-1][0] == pair:
+            runs[-1][1] += 1
+        else:
+            runs.append([pair, 1])
+    texts = [pair if count == 1 else f"{pair} x {count}" for pair, count in runs]
+    more = [f"and {len(texts) - LISTED} more"] if len(texts) > LISTED else []
+    return ", ".join([*texts[:LISTED], *more]) or "none"
