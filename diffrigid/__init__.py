@@ -11,7 +11,7 @@ from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.models import load_mjcf, load_urdf
 from diffrigid.pytree import replace
 from diffrigid.scene import Body, Static, scene
-from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Profile, Sphere
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Hull, Polygon, Profile, Sphere
 from diffrigid.state import (
     State,
     Wrench,
@@ -66,6 +66,7 @@ __all__ = [
     "Force",
     "Gravity",
     "HalfSpace",
+    "HeightField",
     "Homography",
     "Hull",
     "Marker",

@@ -19,7 +19,7 @@ import numpy as np
 from diffrigid.forces import total_wrench
 from diffrigid.hull import hull_faces
 from diffrigid.pytree import align, replace
-from diffrigid.shapes import HalfSpace, Profile, edges, radius, vertices
+from diffrigid.shapes import UNEVEN, HalfSpace, edges, radius, vertices
 from diffrigid.state import momentum, spin
 from diffrigid.step import Trajectory
 from diffrigid.touch import Side, gaps, rotated
@@ -71,7 +71,7 @@ def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> Meetings:
     world, dim = trajectory.world, trajectory.world.dim
     some = _thinned(trajectory)
     motion, (dp, dL, push) = _motion(some), _changes(some)
-    groups = [group for group in world.pairs if not isinstance(world.shapes[group.shape_b], Profile)]
+    groups = [group for group in world.pairs if not isinstance(world.shapes[group.shape_b], UNEVEN)]
     found = [_touches(world, group, motion, dp, dL, push) for group in groups]
     touch = Touch(*(np.concatenate(parts) for parts in zip(*found, strict=True))) if found else None
     if touch is None or not len(touch.s):

@@ -29,6 +29,7 @@ UNITS = {
     "mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2", "g": "m/s^2",
     "x": "m", "v": "m/s", "angle": "rad", "w": "rad/s",
     "radius": "m", "half": "m", "half_length": "m", "vertices": "m", "points": "m", "offset": "m", "width": "m",
+    "heights": "m", "spacing": "m",
     "linear": "N s/m", "angular": "N m s", "stiffness": "N/m", "damping": "N s/m", "length": "m",
     "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
     "restitution_falloff": "s/m", "rolling_friction": "m", "spinning_friction": "m",

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.collide import COLLIDERS, pair_groups
+from diffrigid.collide.distance import reach
+from diffrigid.collide.heights import cells_for
 from diffrigid.contact import Contact
 from diffrigid.contact.crowd import is_many
 from diffrigid.convert import (
@@ -17,6 +19,7 @@ from diffrigid.convert import (
     angular_velocity,
     by_name,
     force_of,
+    known,
     mass_and_inertia,
     materials,
     nearest,
@@ -29,9 +32,9 @@ from diffrigid.convert import (
 from diffrigid.forces import Gravity
 from diffrigid.joint_checks import joints_of, warn_of_torn_joints
 from diffrigid.overlap import near_pairs, overlapping, place
-from diffrigid.pytree import map_arrays, refuse_missing
+from diffrigid.pytree import map_arrays, refuse_missing, replace
 from diffrigid.shape_checks import check_shape
-from diffrigid.shapes import BOUNDLESS, Hull, Polygon, Profile, Shape, dimension, traced
+from diffrigid.shapes import BOUNDLESS, UNEVEN, HeightField, Hull, Polygon, Shape, dimension, traced
 from diffrigid.state import COEFFICIENTS, Bodies, State
 from diffrigid.world import Offset, Statics, World
 
@@ -149,6 +152,7 @@ def scene(
         raise ValueError(f"ignore is {ignore!r}: expected pairs of names, [('arm', 'hand')].")
     passing = _passing([*ignore, *joined], list(everything))
     shapes = {k: None if b.shape is None else shape_of(k, b.shape, dim) for k, b in everything.items()}
+    shapes |= _looking_around(shapes, moving)
     solids = {name: solid_of(shapes[name], dim) for name in moving}
     records, offsets, owners = _stack_shapes(shapes, solids, dim)
     kinds = [type(record) for record in records]
@@ -250,6 +254,26 @@ def _state(moving: Mapping[str, Body], dim: int) -> State:
     return State(**_poses(moving, dim), v=stack(v), w=stack(w))
 
 
+def _looking_around(shapes: Mapping[str, Any], moving: Mapping[str, Body]) -> dict[str, Any]:
+    """The height fields, with how many cells the bodies look around."""
+    found = {}
+    for name, shape in shapes.items():
+        if not isinstance(shape, HeightField):
+            continue
+        sizes = [known(lambda s: reach(s, 3), shapes[body]) for body in moving if shapes[body] is not None]
+        parts = [known(cells_for, shape.spacing, size) for size in sizes]
+        if shape.cells is None and traced(parts):
+            raise ValueError(
+                f"{name}.shape.spacing or the size of a body is traced, so how far it looks around cannot be found: "
+                "give the HeightField cells=..., above the largest size of a body over the spacing by 1."
+            )
+        least = None if traced(parts) else int(max(parts, default=1))
+        if shape.cells is not None and least is not None and shape.cells < least:
+            raise ValueError(f"{name}.shape.cells is {shape.cells}: expected {least} or more, or leave it out.")
+        found[name] = replace(shape, cells=least if shape.cells is None else shape.cells)
+    return found
+
+
 def _stack_shapes(shapes: Mapping[str, Any], solids: Mapping[str, Solid | None], dim: int):
     """Shapes of one kind (type and static fields) in one record each, their offsets, and their owners.
 
@@ -317,13 +341,13 @@ def _contact(contact: Any) -> Contact:
 
 
 def _warn_of_overlap(world: World, state: State, shapes: Mapping, solids: Mapping) -> None:
-    """Warn of pairs that penetrate at the start; those with a profile or a value that is traced are left out."""
+    """Warn of pairs that penetrate at the start; those with uneven ground or a traced value are left out."""
     poses = [*zip(state.x, state.q, strict=True), *zip(world.statics.x, world.statics.q, strict=True)]
     placed = {}
     for index, ((name, shape), (x, q)) in enumerate(zip(shapes.items(), poses, strict=True)):
         solid = solids.get(name)
         center = np.zeros(world.dim) if solid is None else solid.center
-        if shape is not None and not isinstance(shape, Profile) and not traced((shape, center, x, q)):
+        if shape is not None and not isinstance(shape, UNEVEN) and not traced((shape, center, x, q)):
             placed[index] = place(shape, x, q, center)
     pairs = [pair for group in world.pairs for pair in zip(group.a, group.b, strict=True)]
     if world.crowd:

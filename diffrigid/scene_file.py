@@ -27,6 +27,7 @@ starts = 8
 noise = { "ball.x" = 0.001 }
 """
 
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -47,9 +48,7 @@ KINDS: dict[str, Callable] = {
     name: getattr(sysid, name)
     for name in ("interval", "positive", "real", "direction", "rotation", "inertia", "shares")
 }
-SHAPES = {"half_space": shapes.HalfSpace} | {
-    kind.__name__.lower(): kind for kind in shapes.SHAPES if kind is not shapes.HalfSpace
-}
+SHAPES = {re.sub("(?<=.)([A-Z])", r"_\1", kind.__name__).lower(): kind for kind in shapes.SHAPES}
 FORCES = {"spring": forces.SpringDamper} | {
     kind.__name__.lower(): kind for kind in (forces.Drag, forces.Force, forces.Torque)
 }

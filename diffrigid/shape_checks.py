@@ -13,6 +13,7 @@ from diffrigid.shapes import (
     Capsule,
     Disc,
     HalfSpace,
+    HeightField,
     Hull,
     Polygon,
     Profile,
@@ -37,13 +38,16 @@ def check_shape(shape: Shape, where: str) -> None:
     refuse_missing(shape, where)
 
     def check(leaf, letters, path):
-        _check_axes(leaf, letters, path, dimension(shape) if len(letters) == 2 else None)
+        _check_axes(leaf, letters, path, dimension(shape))
         if not traced(leaf):
             value = np.asarray(leaf, floats(leaf).dtype)  # not through jax: under jit that makes a tracer
             _check_values(shape, value, path, path[len(where) + 1 :])
         return leaf
 
     map_arrays(check, shape, where)
+    if isinstance(shape, HeightField) and shape.cells is not None:
+        if not isinstance(shape.cells, int) or isinstance(shape.cells, bool) or shape.cells < 1:
+            raise ValueError(f"{where}.cells is {shape.cells!r}: expected an integer above 0; leave it out.")
     if isinstance(shape, Hull) and shape.faces is not None and not traced(shape.vertices):
         if problem := faces_problem(np.asarray(shape.vertices, float), triples(shape.faces)):
             raise ValueError(f"{where}.faces {problem}")
@@ -56,10 +60,11 @@ def _check_axes(leaf, letters, path, dim):
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path} is {leaf!r}: expected numbers in rows of equal length.") from error
     fits, expected = {
-        0: (shape == (), "one number"),
-        1: (shape in ((2,), (3,)), "2 or 3 numbers"),
-        2: (len(shape) == 2 and shape[-1] == dim and dim < shape[0], f"(V, {dim}) with V > {dim}"),
-    }[len(letters)]
+        (): (shape == (), "one number"),
+        ("D",): (shape in ((2,), (3,)), "2 or 3 numbers"),
+        ("V", "D"): (len(shape) == 2 and shape[-1] == dim and dim < shape[0], f"(V, {dim}) with V > {dim}"),
+        ("R", "C"): (len(shape) == 2 and min(shape) > 1, "(R, C), both above 1"),
+    }[letters]
     if not fits:
         raise ValueError(f"{path} has shape {shape}: expected {expected}, without batch axes.")
 
@@ -105,6 +110,11 @@ def _normal_problem(value):
         return f"has length {length:.9g}: expected a unit vector; divide it (and the offset) by its length."
 
 
+def _spacing_problem(value):
+    if value <= 0:
+        return f"is {value} m: expected above 0; give the distance of neighbouring nodes."
+
+
 def _profile_problem(value):
     if (n := first(np.diff(value[:, 0]) <= FLAT * extent(value))) is not None:
         return f"does not go to the right from point {n}: sort them by x; a steep step needs two different x."
@@ -136,4 +146,5 @@ _RULES = {  # text of what is wrong with a concrete leaf, None if nothing is
     (Hull, "vertices"): hull_problem,
     (HalfSpace, "normal"): _normal_problem,
     (Profile, "points"): _profile_problem,
+    (HeightField, "spacing"): _spacing_problem,
 }

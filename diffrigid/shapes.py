@@ -139,9 +139,32 @@ class Profile:
     points: Leaf = array("V", "D")  # (V, 2, *batch) [m], V >= 3, from left to right
 
 
-SHAPES = (Disc, Sphere, Box, Capsule, Polygon, Hull, HalfSpace, Profile)
-Shape = Disc | Sphere | Box | Capsule | Polygon | Hull | HalfSpace | Profile
-BOUNDLESS = (HalfSpace, Profile)  # for bodies that do not move
+@pytree
+class HeightField:
+    """The solid below a grid of heights in 3D. For bodies that do not move.
+
+    Node (i, j) is at (i spacing, j spacing, heights[i, j]); each cell is two flat triangles, cut from node (i, j) to
+    (i + 1, j + 1). Beyond the grid the heights of its border go on level. (Straight on, as a `Profile` does, cells of
+    different slope would tear.)
+
+    Example:
+        >>> x, y = np.meshgrid(np.linspace(-1.0, 1.0, 9), np.linspace(-1.0, 1.0, 9), indexing="ij")
+        >>> bowl = dr.Static(dr.HeightField(heights=0.3 * (x**2 + y**2), spacing=0.25), x=(-1.0, -1.0, 0.0))
+        >>> marble = dr.Body(dr.Sphere(radius=0.2), mass=1.0, x=(0.5, 0.0, 0.5))
+        >>> made, _ = dr.scene({"marble": marble, "bowl": bowl}, gravity=(0.0, 0.0, -9.81))
+        >>> made.shapes[1].heights.shape  # fitted as "bowl.shape.heights"
+        (1, 9, 9)
+    """
+
+    heights: Leaf = array("R", "C")  # (R, C, *batch) [m], R and C >= 2
+    spacing: Leaf = array()  # (*batch) [m] > 0
+    cells: int | None = static(None)  # how far to each side a body looks, in cells; `scene` finds it from known sizes
+
+
+SHAPES = (Disc, Sphere, Box, Capsule, Polygon, Hull, HalfSpace, Profile, HeightField)
+Shape = Disc | Sphere | Box | Capsule | Polygon | Hull | HalfSpace | Profile | HeightField
+BOUNDLESS = (HalfSpace, Profile, HeightField)  # for bodies that do not move
+UNEVEN = (Profile, HeightField)  # solids that are not convex
 
 
 def dimension(shape: Shape) -> int | None:
@@ -149,7 +172,7 @@ def dimension(shape: Shape) -> int | None:
     match shape:
         case Disc() | Polygon() | Profile():
             return 2
-        case Sphere() | Hull():
+        case Sphere() | Hull() | HeightField():
             return 3
         case Box():
             return len(shape.half)
@@ -198,6 +221,8 @@ def radius(shape: Shape) -> Array:
             return jnp.zeros_like(floats(shape.vertices)[0, 0])
         case Profile():
             return jnp.zeros_like(floats(shape.points)[0, 0])
+        case HeightField():
+            return jnp.zeros_like(floats(shape.spacing))
     return jnp.zeros_like(floats(shape.offset))
 
 

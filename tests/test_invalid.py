@@ -111,6 +111,18 @@ SHAPES = {
     ),
     "HalfSpace.normal": (lambda v: still(dr.HalfSpace(normal=v)), (*VECTOR_2, None, (0.0, 0.0), (0.0, 2.0))),
     "HalfSpace.offset": (lambda v: still(dr.HalfSpace(normal=(0.0, 1.0), offset=v)), (*NUMBER, None)),
+    "HeightField.heights": (
+        lambda v: deep(others={"ground": dr.Static(dr.HeightField(heights=v, spacing=0.5))}),
+        (*(v for v in VECTOR_3 if not isinstance(v, np.ndarray) or v.ndim != 2), None, ((1.0, 2.0),), ((0.0, 0.0), (0.0, np.nan))),
+    ),
+    "HeightField.spacing": (
+        lambda v: deep(others={"ground": dr.Static(dr.HeightField(heights=np.eye(3), spacing=v))}),
+        (*POSITIVE, None),
+    ),
+    "HeightField.cells": (
+        lambda v: deep(others={"ground": dr.Static(dr.HeightField(heights=np.eye(3), spacing=0.5, cells=v))}),
+        tuple(v for v in optional(INTEGER) if v is not HUGE),
+    ),
     "Body.shape": (lambda v: dr.scene({"ball": dr.Body(v, mass=1.0, x=(0.0, 0.0))}), (*RECORD, None)),
     "Static.shape": (lambda v: flat(others={"floor": dr.Static(v)}), (*RECORD, None)),
 }  # fmt: skip

@@ -13,10 +13,11 @@ from collections.abc import Callable
 from diffrigid.collide.contacts import Contacts
 from diffrigid.collide.convex import convex_convex
 from diffrigid.collide.halfspace import box_halfspace, convex_halfspace, round_halfspace
+from diffrigid.collide.heights import convex_heights
 from diffrigid.collide.pairs import PairGroup, pair_groups
 from diffrigid.collide.profile import convex_profile
 from diffrigid.collide.round import round_round
-from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Profile, Sphere
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Hull, Polygon, Profile, Sphere
 
 CONVEX_2D: tuple[type, ...] = (Disc, Capsule, Box, Polygon)
 CONVEX_3D: tuple[type, ...] = (Sphere, Capsule, Box, Hull)
@@ -26,6 +27,7 @@ COLLIDERS: dict[tuple[type, type], Callable[..., Contacts]] = {
 }
 COLLIDERS |= {(a, HalfSpace): convex_halfspace for a in CONVEX_2D + CONVEX_3D}
 COLLIDERS |= {(a, Profile): convex_profile for a in CONVEX_2D}
+COLLIDERS |= {(a, HeightField): convex_heights for a in CONVEX_3D}
 COLLIDERS |= {(Disc, Disc): round_round, (Sphere, Sphere): round_round}
 COLLIDERS |= {(Disc, HalfSpace): round_halfspace, (Sphere, HalfSpace): round_halfspace}
 COLLIDERS[Box, HalfSpace] = box_halfspace

@@ -39,11 +39,11 @@ def crossing_edges(
         contacts: those of the corners; where one touches, its normal is that of the crossings as well.
         separated: (*batch) bool: one of them shows that the bodies do not overlap.
     """
-    edges_a, edges_b = _edges(a, corners_a), _edges(b, corners_b)
+    edges_a, edges_b = edges_of(a, corners_a), edges_of(b, corners_b)
     size_a, size_b = edges_a.start.shape[1], edges_b.start.shape[1]
     down, across, margin = lax.stop_gradient((edges_a, edges_b, slack))
     down, across = Edges(*(leaf[:, :, None] for leaf in down)), Edges(*(leaf[:, None] for leaf in across))
-    order = _order(_crossing(down, across, margin[None, None]), separated, margin[None, None])
+    order = _order(crossing(down, across, margin[None, None]), separated, margin[None, None])
     order = jnp.moveaxis(order.reshape(size_a * size_b, *slack.shape), 0, -1)
     count = (CROSSINGS, 2, 1)[isinstance(a, Capsule) + isinstance(b, Capsule)]
     nearest, index = (jnp.moveaxis(leaf, -1, 0) for leaf in lax.top_k(-order, count))
@@ -53,7 +53,7 @@ def crossing_edges(
         return Edges(*((chosen[None] * leaf).sum(1) for leaf in of))
 
     def one(row):
-        return _crossing(pick(edges_a, row // size_b), pick(edges_b, row % size_b), slack)
+        return crossing(pick(edges_a, row // size_b), pick(edges_b, row % size_b), slack)
 
     chosen = jax.vmap(one)(index)
     exists = (nearest > -FAR) & _along_contact(chosen, contacts, slack)
@@ -63,7 +63,8 @@ def crossing_edges(
     return Contacts(gap=gap, normal=chosen.normal, point=middle)
 
 
-def _edges(shape, corners: Array) -> Edges:
+def edges_of(shape, corners: Array) -> Edges:
+    """The edges of a shape whose corners are at (V, 3, *batch) [m]."""
     columns = *zip(*edges(shape, 3), strict=True), *zip(*edge_apexes(shape, 3), strict=True)
     start, end, left, right = (jnp.swapaxes(rows(corners, index), 0, 1) for index in columns)
     return Edges(start, end - start, left - start, right - start)
@@ -80,7 +81,7 @@ class Crossing(NamedTuple):
     outermost: Array  # (*batch) bool: along the normal, both edges are where their shapes end
 
 
-def _crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
+def crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
     """Closest points of two lines, from 2 x 2 normal equations, and whether their shapes may touch there.
 
     They may if the faces beside both edges fall away from the normal (arcs that cross in the Gauss map).

@@ -19,9 +19,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.collide.heights import height_over, unseen_for
 from diffrigid.contact.sides import (
     Placed,
     Side,
+    candidates_of,
     centre,
     contacts_of,
     gap_rates,
@@ -31,6 +33,7 @@ from diffrigid.contact.sides import (
 )
 from diffrigid.numerics import (
     FOUND,
+    LARGE,
     apart,
     dot,
     fold,
@@ -42,9 +45,10 @@ from diffrigid.numerics import (
     softplus,
     some,
 )
-from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere, radius, vertices
+from diffrigid.shapes import Disc, HalfSpace, HeightField, Shape, Sphere, radius, vertices
 from diffrigid.state import rotations
 
+CROSSED = 3  # advances for each node along a side of a grid: the length of its diagonal in half cells
 ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
 POLISH = 6  # steps along the local parabola of the gap; error squared by each
 NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over to polishing
@@ -216,7 +220,7 @@ def _motion(a: Side, b: Side, s: Array, live: Array) -> tuple[Array, Array, Arra
     at_a, at_b = place(a, s, live), place(b, s, live)
     if isinstance(b.shape, HalfSpace):
         return *_corner_motion(a, at_a, b), None
-    contacts = contacts_of(a, at_a, b, at_b)
+    contacts = candidates_of(a, at_a, b, at_b)
 
     def pull(n, p):
         return dot(n, relative_acceleration(at_a, at_b, p))
@@ -266,6 +270,8 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
     live, span = opaque_true(t1), jnp.maximum(t1 - start, 0.0)
     (spin_a, jerk_a), (spin_b, jerk_b) = _unsteady(a, span), _unsteady(b, span)
     spinning, jerk = spin_a + spin_b, jerk_a + jerk_b
+    # Across a grid an advance ends after half a cell, or in contact.
+    most = ADVANCES + (CROSSED * sum(b.shape.heights.shape[:2]) if isinstance(b.shape, HeightField) else 0)
 
     def safe_time(s):
         gap, v, acc, normal = _motion(a, b, s, live)
@@ -276,11 +282,17 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
             bound = jnp.maximum(-(normal * approach[None]).sum(1), 0.0) + spinning[None]
             apart = jnp.where(bound > 0, safe_divide(gap, bound), jnp.inf)
         returns = jnp.where(v < 0, 0.0, _time_to(gap, v, acc))
-        return fold(jnp.minimum, jnp.where(gap > near[None], apart, returns), 0)
+        first = _least(jnp.where(gap > near[None], apart, returns))
+        return jnp.minimum(first, unseen(s)) if isinstance(b.shape, HeightField) else first
+
+    def unseen(s):
+        x, v = centre(a, s)
+        height = height_over(b.shape, x, b.x, b.q) - reach_of(a)
+        return jnp.where(s < t1, unseen_for(b.shape, b.q, height, v, spinning), jnp.inf)
 
     def busy(carry):
         count, s, dt = carry
-        return (count == 0) | ((count < ADVANCES) & some((dt > 0) & (s < t1)))
+        return (count == 0) | ((count < most) & some((dt > 0) & (s < t1)))
 
     def advance(carry):
         count, s, dt = carry
@@ -288,6 +300,11 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
         return count + 1, onward, safe_time(onward)
 
     return lax.while_loop(busy, advance, (0, start, jnp.zeros_like(start)))[1]
+
+
+def _least(times: Array) -> Array:
+    """Of the contacts (K, *batch). Written out only where they are few: the program is not to grow with a grid."""
+    return fold(jnp.minimum, times, 0) if len(times) <= LARGE else times.min(0)
 
 
 def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
@@ -324,7 +341,7 @@ def _polish(
         gap, v, acc, _ = _motion(a, b, s, live)
         height = gap - level[None]
         there = (jnp.abs(height) <= 8.0 * slack**2 * size[None]) & (v < 0)  # to rounding
-        dt = fold(jnp.minimum, jnp.where(there, 0.0, _time_to(height, v, acc)), 0)
+        dt = _least(jnp.where(there, 0.0, _time_to(height, v, acc)))
         dt = jnp.where(jnp.isfinite(dt) & ((dt < 0) | (s < t1 + slack * span)), dt, 0.0)  # what is later is no impact
         at_level = (gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0))
         inside = jnp.where(count == 0, ((gap <= level[None]) & (v < 0)).any(0), inside)

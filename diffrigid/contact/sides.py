@@ -9,10 +9,11 @@ from jax import Array, lax
 
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.distance import reach
+from diffrigid.collide.heights import candidates
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.numerics import apart, dot, norm, rows, sum_rows
 from diffrigid.pytree import array, pytree
-from diffrigid.shapes import HalfSpace, Profile
+from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
 
 
@@ -92,6 +93,13 @@ def contacts_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
     return COLLIDERS[type(a.shape), type(b.shape)](a.shape, *_origin(a, at_a), b.shape, *_origin(b, at_b))
 
 
+def candidates_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
+    """What a search for an impact must know: more than the contacts if these are chosen from many."""
+    if isinstance(b.shape, HeightField):
+        return candidates(a.shape, *_origin(a, at_a), b.shape, *_origin(b, at_b))
+    return contacts_of(a, at_a, b, at_b)
+
+
 def _origin(side: Side, at: Placed) -> tuple[Array, Array]:
     if side.offset is None:
         return at.x, at.q
@@ -138,6 +146,8 @@ def reach_of(side: Side) -> Array:
         return jnp.full_like(side.shape.offset, 1e6)
     if isinstance(side.shape, Profile):
         return jnp.full_like(side.shape.points[0, 0], 1e6)
+    if isinstance(side.shape, HeightField):
+        return jnp.full_like(side.shape.spacing, 1e6)
     shape, offset = lax.stop_gradient((side.shape, side.offset))
     dim = side.x.shape[0] if side.flight is None else side.flight.dim
     return reach(shape, dim) if offset is None else reach(shape, dim) + norm(offset)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix, restitution_at
@@ -18,7 +19,7 @@ from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
 from diffrigid.numerics import apart, constant, dot, norm, opaque_true, rows, some
 from diffrigid.pytree import array, pytree, replace
-from diffrigid.shapes import HalfSpace, Profile
+from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
 
 
@@ -103,6 +104,8 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
         elif isinstance(b.shape, Profile):
             p = rotations(2).unrotate(b.q, x_a - x_b)
             apart, closing = clearance(b.shape, p) - reach_of(a), norm(v_a - v_b)
+        elif isinstance(b.shape, HeightField):
+            apart, closing = height_over(b.shape, x_a, b.x, b.q) - reach_of(a), norm(v_a - v_b)
         else:
             apart, closing = norm(x_a - x_b) - reach_of(a) - reach_of(b), norm(v_a - v_b)
         pull = jnp.zeros_like(dt)

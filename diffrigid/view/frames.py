@@ -15,12 +15,13 @@ from diffrigid.forces import Gravity, SpringDamper
 from diffrigid.impacts import find_contacts
 from diffrigid.joints import Distance
 from diffrigid.pytree import align, batch_rank
-from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Profile, Shape, Sphere, with_topology
+from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Profile, Shape, Sphere, with_topology
 from diffrigid.state import State, kinetic_energy
 from diffrigid.step import Trajectory
 from diffrigid.sysid.records import columns
 from diffrigid.sysid.sensors import Part
 from diffrigid.touch import rotated
+from diffrigid.view.outline import nodes
 from diffrigid.world import World
 
 LEVELS = 65534  # of a packed number; 65535 is NaN
@@ -156,9 +157,18 @@ def _kind(shape: Shape) -> dict[str, Any]:
             line = np.asarray(shape.points, float)
             left, right, low = line[0, 0], line[-1, 0], line[:, 1].min() - 0.1 * np.ptp(line[:, 0])
             return {"kind": "hull", "points": _short(np.concatenate([line, [(right, low), (left, low)]]))}
+        case HeightField():
+            return {"kind": "hull", "points": _short(nodes(shape).reshape(-1, 3)), "faces": _triangles(shape)}
     solid: Any = with_topology(shape)
     faces = {"faces": [list(face) for face in solid.faces]} if len(shape.vertices[0]) == 3 else {}
     return {"kind": "hull", "points": _short(shape.vertices)} | faces
+
+
+def _triangles(shape: HeightField) -> list:
+    """Both faces of each cell, as triples of nodes, counter-clockwise from above."""
+    number = np.arange(np.size(shape.heights)).reshape(np.shape(shape.heights))
+    near, right, left, far = (n.ravel() for n in (number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]))
+    return np.concatenate([np.stack([near, right, far], 1), np.stack([near, far, left], 1)]).tolist()
 
 
 def links(world: World) -> list[dict[str, Any]]:

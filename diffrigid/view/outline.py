@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffrigid.shapes import Capsule, Disc, HalfSpace, Profile, Shape, Sphere, edges, vertices
+from diffrigid.shapes import Capsule, Disc, HalfSpace, HeightField, Profile, Shape, Sphere, edges, vertices
 
 REACH = 50.0  # [m] half width of a drawn half space
 
@@ -11,7 +11,7 @@ def outline(shape: Shape, dim: int, points: int = 48):
     """Lines to draw, NumPy: in 2D one closed polyline (P, 2) [m], in 3D a list of polylines (P_i, 3) [m].
 
     Round parts have about `points` points a turn. A half space is a long segment (2, 2), or a large square;
-    a profile is its line between its ends.
+    a profile is its line between its ends, a height field the lines of its grid.
     """
     return _outline_2d(shape, points) if dim == 2 else _outline_3d(shape, points)
 
@@ -42,8 +42,17 @@ def _outline_3d(shape, points):
             across = np.linalg.svd(normal[None])[2][1:]  # two unit vectors that span the surface
             square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
             return [float(shape.offset) * normal + REACH * square @ across]
+        case HeightField():
+            grid = nodes(shape)
+            return [*grid, *grid.swapaxes(0, 1)]
     corners = np.asarray(vertices(shape, 3))
     return [corners[list(pair)] for pair in edges(shape, 3)]
+
+
+def nodes(shape: HeightField) -> np.ndarray:
+    """Nodes of a height field in its axes, (R, C, 3) [m]."""
+    z = np.asarray(shape.heights, float)
+    return np.stack([*(float(shape.spacing) * np.indices(z.shape)), z], axis=2)
 
 
 def _capsule_lines(r, h, points):
