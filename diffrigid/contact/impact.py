@@ -76,7 +76,7 @@ def find_impact(
     if closed_form(a.shape, b.shape, straight):
         s0, level, found = apart(live, functools.partial(approach, straight=straight), a, b, t1, width)[:3]
     else:
-        s0, level, found, _ = approach(a, b, t1, width, straight)
+        s0, level, found, _ = approach(a, b, t1, width, straight, rest_speed)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     s0, hit = checkpoint_name((s0, hit), FOUND)
@@ -95,14 +95,15 @@ def find_impact(
     return s, hit | at_end, level, slack
 
 
-def approach(a: Side, b: Side, t1: Array, width: Array | None, straight: bool):
+def approach(a: Side, b: Side, t1: Array, width: Array | None, straight: bool, rest_speed: Array | None = None):
     """Time of the impact (no gradient), level of the gap at which it happens, whether there is one, closing speed.
 
-    The speed is None where the time has no closed form.
+    The speed is None where the time has no closed form. Then a contact that rests at the start, by
+    `rest_speed`, is no impact, nor does it hide another of the pair.
     """
     varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
     if varying or not closed_form(a.shape, b.shape, straight):
-        return *_approach_search(a, b, t1, width), None
+        return *_approach_search(a, b, t1, width, rest_speed), None
     return _approach_parabola(a, b, width) if isinstance(b.shape, HalfSpace) else _approach_straight(a, b, width)
 
 
@@ -199,19 +200,22 @@ def meet_on_parabola(gap: Array, v: Array, acc: Array | None, width: Array | Non
     return s, level, found, root, sunk
 
 
-def _approach_search(a: Side, b: Side, t1: Array, width: Array | None) -> tuple[Array, Array, Array]:
+def _approach_search(
+    a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array | None
+) -> tuple[Array, Array, Array]:
     """Any two shapes: conservative advancement to the neighbourhood, then the parabola of the next contact."""
     start, bound = _earliest(a, b)
     frozen_a, frozen_b = lax.stop_gradient((a, b))
     size = jnp.minimum(reach_of(a), reach_of(b))
-    near = checkpoint_name(_advance(frozen_a, frozen_b, start, t1, NEAR * size), FOUND)
+    slow = jnp.zeros_like(t1) if rest_speed is None else lax.stop_gradient(rest_speed)
+    near, rests = checkpoint_name(_advance(frozen_a, frozen_b, start, t1, size, slow), FOUND)
     live = opaque_true(t1)
 
     def smooth(near):
         return _closest_level(a, b, near, t1 - start, width, live)  # type: ignore[arg-type]
 
     level = _if_smooth(width, smooth, jnp.zeros_like, near)
-    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, start, t1, live)
+    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, start, t1, rests, live)
     return jnp.where(s < bound, start, s), level, found
 
 
@@ -258,8 +262,11 @@ def _time_to(height: Array, v: Array, acc: Array) -> Array:
     return jnp.where(sunk, 0.0, jnp.where(v < 0, closing, returning))
 
 
-def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
-    """Advance until a contact is within `near` and closing, or the step is over.
+def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array) -> tuple[Array, Array]:
+    """Advance until a contact is near and closing, or the step is over; and which contacts (K, *batch) rest.
+
+    Those touch, or fall onto each other at once, no faster than `slow` [m/s]. They are left out: in a flight without
+    support they would be the next to close, and hide the fast impact of another corner.
 
     Each advance is the least, over the contacts, of the gap over a bound on the closing speed for the present
     normal (Mirtich 1996), so that a body that only translates arrives in one. The gap of a corner and a plane is
@@ -267,14 +274,13 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
     third derivative can be, which takes two or three advances. A contact that touches and separates may be passed for
     as long as its parabola stays open.
     """
-    live, span = opaque_true(t1), jnp.maximum(t1 - start, 0.0)
+    live, span, near = opaque_true(t1), jnp.maximum(t1 - start, 0.0), NEAR * size
     (spin_a, jerk_a), (spin_b, jerk_b) = _unsteady(a, span), _unsteady(b, span)
     spinning, jerk = spin_a + spin_b, jerk_a + jerk_b
     # Across a grid an advance ends after half a cell, or in contact.
     most = ADVANCES + (CROSSED * sum(b.shape.heights.shape[:2]) if isinstance(b.shape, HeightField) else 0)
 
-    def safe_time(s):
-        gap, v, acc, normal = _motion(a, b, s, live)
+    def safe_time(gap, v, acc, normal, rests, s):
         if normal is None:
             apart = _time_to(gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
         else:
@@ -282,7 +288,7 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
             bound = jnp.maximum(-(normal * approach[None]).sum(1), 0.0) + spinning[None]
             apart = jnp.where(bound > 0, safe_divide(gap, bound), jnp.inf)
         returns = jnp.where(v < 0, 0.0, _time_to(gap, v, acc))
-        first = _least(jnp.where(gap > near[None], apart, returns))
+        first = _least(jnp.where(rests, jnp.inf, jnp.where(gap > near[None], apart, returns)))
         return jnp.minimum(first, unseen(s)) if isinstance(b.shape, HeightField) else first
 
     def unseen(s):
@@ -291,15 +297,19 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, near: Array) -> Array:
         return jnp.where(s < t1, unseen_for(b.shape, b.q, height, v, spinning), jnp.inf)
 
     def busy(carry):
-        count, s, dt = carry
+        count, s, dt, _ = carry
         return (count == 0) | ((count < most) & some((dt > 0) & (s < t1)))
 
     def advance(carry):
-        count, s, dt = carry
+        count, s, dt, rests = carry
         onward = jnp.where(s < t1, jnp.minimum(s + jnp.maximum(dt, 0.0), t1), s)
-        return count + 1, onward, safe_time(onward)
+        gap, v, acc, normal = _motion(a, b, onward, live)
+        square = v * v + 2.0 * jnp.maximum(gap, 0.0) * jnp.abs(acc)  # of the speed at which it touches
+        rests = jnp.where(count == 0, (gap <= near[None]) & (square <= slow[None] ** 2), rests)
+        return count + 1, onward, safe_time(gap, v, acc, normal, rests, onward), rests
 
-    return lax.while_loop(busy, advance, (0, start, jnp.zeros_like(start)))[1]
+    contacts = jax.eval_shape(lambda: _motion(a, b, start, live)[0]).shape
+    return lax.while_loop(busy, advance, (0, start, jnp.zeros_like(start), jnp.zeros(contacts, bool)))[1::2]
 
 
 def _least(times: Array) -> Array:
@@ -327,9 +337,12 @@ def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
 
 
 def _polish(
-    a: Side, b: Side, s: Array, level: Array, size: Array, start: Array, t1: Array, live: Array
+    a: Side, b: Side, s: Array, level: Array, size: Array, start: Array, t1: Array, rests: Array, live: Array
 ) -> tuple[Array, Array]:
-    """Time near s at which the first contact comes to gap = level, and whether one does; s if inside and closing."""
+    """Time near s at which the first contact comes to gap = level, and whether one does; s if inside and closing.
+
+    Not of contacts that rest, (K, *batch) bool.
+    """
     slack, near, span = jnp.sqrt(jnp.finfo(s.dtype).eps), s, t1 - start
 
     def busy(carry):
@@ -341,10 +354,10 @@ def _polish(
         gap, v, acc, _ = _motion(a, b, s, live)
         height = gap - level[None]
         there = (jnp.abs(height) <= 8.0 * slack**2 * size[None]) & (v < 0)  # to rounding
-        dt = _least(jnp.where(there, 0.0, _time_to(height, v, acc)))
+        dt = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
         dt = jnp.where(jnp.isfinite(dt) & ((dt < 0) | (s < t1 + slack * span)), dt, 0.0)  # what is later is no impact
-        at_level = (gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0))
-        inside = jnp.where(count == 0, ((gap <= level[None]) & (v < 0)).any(0), inside)
+        at_level = (gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0)) & ~rests
+        inside = jnp.where(count == 0, ((gap <= level[None]) & (v < 0) & ~rests).any(0), inside)
         return count + 1, s + dt, dt, at_level.any(0), inside
 
     _, s, _, found, inside = lax.while_loop(busy, towards, (0, s, jnp.inf + s, s < s, s < s))

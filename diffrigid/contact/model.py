@@ -143,7 +143,8 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     closing = -jax.vmap(dot)(strikes.normal, strikes.pull)
     rests = slow | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
     found = resting | (strikes.active & (slow | (now & rests)))
-    held = jnp.where(push, resting & ~drives, strikes.active & (resting | _falls_along(flight, world, u, dt)))
+    falls = u <= world.contact.rest_speed[None] + 2.0 * jnp.maximum(_fall(flight, dt)[None], closing * dt[None])
+    held = jnp.where(push, resting & ~drives, strikes.active & (resting | falls))
     now, resting = jnp.where(impact, now, held), jnp.where(impact, found, held)
     began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
     held_for = jnp.where(impact | push, 0.0, dt[None] - began)
@@ -171,10 +172,9 @@ def _rows_of(flags: tuple[bool, ...], like: Array) -> Array:
     return jnp.asarray(constant(flags, "bool")).reshape(len(flags), *[1] * (like.ndim - 1))
 
 
-def _falls_along(flight: Flight, world: Any, u: Array, dt: Array) -> Array:
-    """Contacts that close no faster than free fall over the step: boxes of a stack fall side by side."""
-    fall = dt * jnp.sqrt((flight.a**2).sum(1).max(0))
-    return u <= (world.contact.rest_speed + 2.0 * fall)[None]
+def _fall(flight: Flight, dt: Array) -> Array:
+    """Speed of free fall after the step, (*batch) [m/s]: what closes no faster than twice that has rested before it."""
+    return dt * jnp.sqrt((flight.a**2).sum(1).max(0))
 
 
 def _is_next(strikes: Strikes, fast: Array, islands: tuple[tuple[int, ...], ...], dt: Array) -> Array:
