@@ -196,7 +196,7 @@ def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Next:
 
     def sooner(best: tuple, b: Side, number: Array, there: Any, speeds: Array) -> tuple:
         first, fastest, other = best
-        s, _, found, u = approach(bodies, b, dt, None, True)
+        s, _, found, u = approach(bodies, b, None)
         closes = u > jnp.maximum(ROUNDING * eps * speeds, SLOW * rest_speed)
         s = jnp.where(there & found & (s <= dt) & closes, jnp.floor(s / tie), jnp.inf)
         # At the same time the fastest first, then the lower number: alike for both sides, so that some pair agrees.

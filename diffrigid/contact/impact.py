@@ -12,8 +12,6 @@ which is Newton's law at a slightly larger distance: it keeps momentum, makes no
 (gap_min far below zero) as they are, and lets a near miss pull.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -56,7 +54,7 @@ NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over t
 
 def find_impact(
     a: Side, b: Side, t1: Array, width: Array | None, straight: bool, rest_speed: Array, at_end: Array
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """First impact of one pair before t1, or the end of the step itself.
 
     Args:
@@ -68,15 +66,18 @@ def find_impact(
 
     Returns:
         s (*batch) [s]; hit (*batch) bool, it happens before t1; level (*batch) [m] of the gap at which it
-        happens; slack (*batch) [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size.
+        happens; slack (*batch) [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size;
+        rests (*batch) bool, some contact rests from the start: it is no impact, nor does it hide that of another.
 
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
     """
     live = opaque_true(t1)
-    if closed_form(a.shape, b.shape, straight):
-        s0, level, found = apart(live, functools.partial(approach, straight=straight), a, b, t1, width)[:3]
+    varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
+    if closed_form(a.shape, b.shape, straight) and not varying:
+        s0, level, found, _ = apart(live, approach, a, b, width)
+        rests = jnp.zeros_like(found)
     else:
-        s0, level, found, _ = approach(a, b, t1, width, straight, rest_speed)
+        s0, level, found, rests = _approach_search(a, b, t1, width, rest_speed)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     s0, hit = checkpoint_name((s0, hit), FOUND)
@@ -92,18 +93,11 @@ def find_impact(
     at_once = jnp.any(closing & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
     s = jnp.where(at_once, begin, s)
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
-    return s, hit | at_end, level, slack
+    return s, hit | at_end, level, slack, rests
 
 
-def approach(a: Side, b: Side, t1: Array, width: Array | None, straight: bool, rest_speed: Array | None = None):
-    """Time of the impact (no gradient), level of the gap at which it happens, whether there is one, closing speed.
-
-    The speed is None where the time has no closed form. Then a contact that rests at the start, by
-    `rest_speed`, is no impact, nor does it hide another of the pair.
-    """
-    varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
-    if varying or not closed_form(a.shape, b.shape, straight):
-        return *_approach_search(a, b, t1, width, rest_speed), None
+def approach(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:
+    """Where it has a closed form: time of the impact (no gradient), level of the gap, whether there is one, speed."""
     return _approach_parabola(a, b, width) if isinstance(b.shape, HalfSpace) else _approach_straight(a, b, width)
 
 
@@ -201,14 +195,14 @@ def meet_on_parabola(gap: Array, v: Array, acc: Array | None, width: Array | Non
 
 
 def _approach_search(
-    a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array | None
-) -> tuple[Array, Array, Array]:
+    a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array
+) -> tuple[Array, Array, Array, Array]:
     """Any two shapes: conservative advancement to the neighbourhood, then the parabola of the next contact."""
     start, bound = _earliest(a, b)
     frozen_a, frozen_b = lax.stop_gradient((a, b))
     size = jnp.minimum(reach_of(a), reach_of(b))
-    slow = jnp.zeros_like(t1) if rest_speed is None else lax.stop_gradient(rest_speed)
-    near, rests = checkpoint_name(_advance(frozen_a, frozen_b, start, t1, size, slow), FOUND)
+    near, rests = _advance(frozen_a, frozen_b, start, t1, size, lax.stop_gradient(rest_speed))
+    near, rests = checkpoint_name((near, rests), FOUND)
     live = opaque_true(t1)
 
     def smooth(near):
@@ -216,7 +210,7 @@ def _approach_search(
 
     level = _if_smooth(width, smooth, jnp.zeros_like, near)
     s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, start, t1, rests, live)
-    return jnp.where(s < bound, start, s), level, found
+    return jnp.where(s < bound, start, s), level, found, rests.any(0)
 
 
 def _motion(a: Side, b: Side, s: Array, live: Array) -> tuple[Array, Array, Array, Array | None]:

@@ -202,7 +202,7 @@ def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> 
     else:
 
         def one(a: Side, b: Side) -> Array:
-            s, _, found, u = approach(a, b, dt, None, True)
+            s, _, found, u = approach(a, b, None)
             return jnp.where(found, jnp.where((u <= world.contact.rest_speed) & (s <= dt), RESTS, s), jnp.inf)
 
         times = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(a, b)

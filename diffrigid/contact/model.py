@@ -164,7 +164,7 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
         return _apply(world, anchors, flight, strikes, (target, mu, most), kick, lever, held_for)
 
     any_now = some(now)
-    return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, some(resting)
+    return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, some(resting | strikes.rests)
 
 
 def _rows_of(flags: tuple[bool, ...], like: Array) -> Array:

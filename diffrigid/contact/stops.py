@@ -101,7 +101,7 @@ def _row(kind: str, dt: Array, at_end: Array, joint: Any, a: Flight, b: Flight, 
     return Strikes(
         active=active, s=s, gap=gap(s) if kind != "friction" else jnp.zeros_like(s), normal=first, arm_a=none,
         arm_b=none, K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,
-        pull=bend[None] * first, drift=none,
+        pull=bend[None] * first, drift=none, rests=jnp.zeros_like(active),
         jac=jac,
     )  # fmt: skip
 

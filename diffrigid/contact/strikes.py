@@ -54,7 +54,7 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
     """
     both_move = a.flight is not None and b.flight is not None
     straight, rest_speed = relative_path_is_straight(world, both_move), world.contact.rest_speed
-    s, hit, level, slack = find_impact(a, b, dt, width, straight, rest_speed, at_end)
+    s, hit, level, slack, rests = find_impact(a, b, dt, width, straight, rest_speed, at_end)
     live = opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
     contacts = contacts_of(a, at_a, b, at_b)
@@ -76,7 +76,7 @@ def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Ar
         return Strikes(
             active=gap < 0, s=s, gap=jnp.where(touching, 0.0, gap), normal=normal, arm_a=arm_a, arm_b=arm_b,
             K=effective_matrix(at_a, arm_a, at_b, arm_b), v_rel=relative_velocity(at_a, arm_a, at_b, arm_b),
-            pull=pull, drift=drift,
+            pull=pull, drift=drift, rests=rests,
         )  # fmt: skip
 
     return replace(jax.vmap(each)(contacts.normal, contacts.point, contacts.gap), active=active)

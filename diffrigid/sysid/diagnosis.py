@@ -117,7 +117,7 @@ def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
     if all(c.logarithmic for c, _ in parts):
         if len(parts) == 2:
             power = steps[0] / steps[1]  # a^p with b^1 move together: a / b^p is seen
-            if abs(power) < 1:
+            if abs(power) < 0.98:
                 names, power = names[::-1], 1 / power
             exponent = "" if abs(abs(power) - 1) < 0.02 else f"^{abs(power):.3g}"
             what = "ratio" if power > 0 and not exponent else "product" if not exponent else "combination"

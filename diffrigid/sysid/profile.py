@@ -16,6 +16,7 @@ from diffrigid.sysid.summary import Parameter
 
 WIDE = 1.6  # of the half width of the interval from the Jacobian: how far the profile goes on either side
 FURTHER = 3  # times it then goes twice as far, where the cost has not risen to the level
+REFINED = 2  # times that the level is bracketed again after such steps
 FAR = 15.0  # z of a bounded number that is at its bound to single precision
 
 
@@ -88,21 +89,20 @@ def _extended(
         most: size of z beyond which it does not go.
     """
     middle, rise, share = z[len(z) // 2], _rises(fit, index, z), np.arange(1, count + 1) / count
+
+    def also(new: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.concatenate([z, new]), np.concatenate([rise, _rises(fit, index, new)])
+
     for side in (-1, 1):
-        for further in range(FURTHER + 1):
-            outer = np.argmax(side * z)
-            last, reached = side * z[outer], rise[outer] > level
-            if reached and further:  # the steps were long: again between the points about the level
-                below = (side * z)[(rise <= level) & (side * z >= side * middle)].max()
-                above = (side * z)[(rise > level) & (side * z > below)].min()
-                new = side * (below + (above - below) * share[:-1])
-            elif not reached and further < FURTHER and last < most:
-                new = side * np.minimum(last + (last - side * middle) * share, most)
-            else:
-                break
-            z, rise = np.concatenate([z, new]), np.concatenate([rise, _rises(fit, index, new)])
-            if reached:
-                break
+        longer = 0
+        while longer < FURTHER and rise[outer := np.argmax(side * z)] <= level and (last := side * z[outer]) < most:
+            z, rise = also(side * np.minimum(last + (last - side * middle) * share, most))
+            longer += 1
+        refinements = REFINED if longer and rise[np.argmax(side * z)] > level else 0
+        for _ in range(refinements):  # the steps were long: again between the points about the level
+            below = (side * z)[(rise <= level) & (side * z >= side * middle)].max()
+            above = (side * z)[(rise > level) & (side * z > below)].min()
+            z, rise = also(side * (below + (above - below) * share[:-1]))
     z, order = np.unique(z, return_index=True)
     rise = rise[order]
     return z[np.isfinite(rise)], rise[np.isfinite(rise)]
