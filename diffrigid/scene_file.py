@@ -84,6 +84,9 @@ def read_scene(path: str | Path) -> SceneFile:
     for key in data:
         if key not in (*TABLES, *ARGUMENTS):
             raise ValueError(f"{path}: unknown key {key!r}: {nearest(key, (*TABLES, *ARGUMENTS))}")
+    for key in TABLES:
+        if not isinstance(data.get(key, {}), Mapping):
+            raise ValueError(f"{path}: {key} is {data[key]!r}: expected a table")
     bodies = {name: _body(f"{path}: bodies.{name}", Body, entry) for name, entry in data.get("bodies", {}).items()}
     statics = {name: _body(f"{path}: statics.{name}", Static, entry) for name, entry in data.get("statics", {}).items()}
     arguments = {key: data[key] for key in ARGUMENTS if key in data}
@@ -140,10 +143,15 @@ def _paths(key: str) -> str | tuple[str, ...]:
 
 
 def _kind(where: str, entry: Any) -> Any:
+    if not isinstance(entry, str) and not (isinstance(entry, Mapping) and len(entry) == 1):
+        raise ValueError(f'{where} is {entry!r}: expected one kind, such as "real" or {{ interval = [0, 1] }}')
     name, arguments = (entry, []) if isinstance(entry, str) else next(iter(entry.items()))
     if name not in KINDS:
         raise ValueError(f"{where} is {name!r}: {nearest(name, KINDS)}")
-    return KINDS[name](*(arguments if isinstance(arguments, list) else [arguments]))
+    try:
+        return KINDS[name](*(arguments if isinstance(arguments, list) else [arguments]))
+    except TypeError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def _observer(where: str, entry: Any) -> Any:

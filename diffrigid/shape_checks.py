@@ -38,7 +38,7 @@ def check_shape(shape: Shape, where: str) -> None:
     refuse_missing(shape, where)
 
     def check(leaf, letters, path):
-        _check_axes(leaf, letters, path, dimension(shape))
+        _check_axes(leaf, letters, path, dimension(shape) if len(letters) == 2 else None)
         if not traced(leaf):
             value = np.asarray(leaf, floats(leaf).dtype)  # not through jax: under jit that makes a tracer
             _check_values(shape, value, path, path[len(where) + 1 :])

@@ -219,6 +219,7 @@ REFUSED = {
     "axis": (mjcf('<body name="a"><joint axis="0 0 0"/><geom size="1"/></body>'), "axis is zero"),
     "frame": (mjcf("<frame/>" + BALL), "<frame> in 'world' cannot be loaded"),
     "global": (mjcf(BALL, '<compiler coordinate="global"/>'), "expected local"),
+    "a file that is cut short": ('<mujoco><include file="part.xml"/></mujoco>', "part.xml is no XML file"),
     "circle of files": ('<mujoco><include file="model.xml"/></mujoco>', "includes itself"),
 }  # fmt: skip
 
@@ -240,8 +241,10 @@ URDF_REFUSED = {
 )
 def test_what_cannot_be_loaded_is_named(load, refused, case, write):
     text, message = refused[case]
+    path = write(text)
+    path.with_name("part.xml").write_text("<mujoco><worldbody>")
     with pytest.raises(ValueError, match=message):
-        load(write(text))
+        load(path)
 
 
 def test_quaternions_of_all_rotations():

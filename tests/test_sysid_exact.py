@@ -4,6 +4,8 @@ import json
 import sys
 from functools import partial
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
@@ -163,6 +165,20 @@ def test_score_and_prediction_of_held_out_records(fit):
     t, x, v = np.asarray(motion.t) - 0.1, fit["p.x"].value[1], fit["p.v"].value[1]
     fall = x + v * t[:, None] + 0.5 * fit["gravity"].value * t[:, None] ** 2
     assert_allclose(motion.state.x[:, 0], fall, atol=1e-9)
+
+
+def test_prediction_takes_the_steps_of_the_fit():
+    """Over a hole in the record, and where times are those of a clock, too large for single precision."""
+    world, state = (jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), part) for part in spring(2.0, 0.0))
+    late, t = 1.7e9, np.concatenate([np.arange(10), np.arange(40, 50)]) / 20
+    data = {"t": late + t, "p.x[0]": np.cos(2 * t)}
+    found = dr.fit(world, state, data, free={"spring.stiffness": dr.positive()}, dt=0.05, progress=False)
+    motion = found.predict()
+    assert_allclose(motion.t, late + t, rtol=0, atol=1e-6)
+    assert_allclose(motion.state.x[:, 0, 0], np.cos(2 * t), atol=1e-4)  # a step over the hole: 0.2
+    assert_allclose(found.predict(times=[late + 1.0]).state.x[0, 0, 0], np.cos(2.0), atol=1e-4)
+    with pytest.raises(ValueError, match="expected times from 1.7e.09 s on, where record 0 starts"):
+        found.predict(times=[1.0, 2.0])
 
 
 def test_records_that_were_fitted_are_scored_from_what_was_found(fit, records, monkeypatch):

@@ -350,6 +350,10 @@ def test_a_scene_file_is_the_scene_it_describes(tmp_path):
         (('"real"', '"reel"'), "did you mean 'real'"),
         (("starts = 2", "start = 2"), "did you mean 'starts'"),
         (("mass = 1.0", "mass = "), "no TOML file"),
+        (('"b.v" = "real"', '"b.v" = 3'), "free.b.v is 3: expected one kind"),
+        (("{ interval = [0, 1] }", "{}"), "free.restitution is {}: expected one kind"),
+        (("{ interval = [0, 1] }", "{ interval = [0] }"), "free.restitution: .*high"),
+        ((SCENE, "bodies = 3"), "bodies is 3: expected a table"),
     ],
 )
 def test_mistakes_in_scene_files(tmp_path, change, message):

@@ -109,7 +109,7 @@ def _include(root: ElementTree.Element, folder: Path, parents: tuple[Path, ...])
                 path = (folder / element.get("file", "")).resolve()
                 if path in parents:
                     raise ValueError(f"{path} includes itself.")
-                inner = read_xml(path, ElementTree.parse(path).getroot().tag)
+                inner = read_xml(path, None)
                 _include(inner, folder, (*parents, path))
                 parent.remove(element)
                 for child in reversed(inner):

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 
-def read_xml(path: str | Path, root: str) -> ElementTree.Element:
-    """The root of a file.
+def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
+    """The root of a file; whatever it is called if `root` is None.
 
     Raises:
         ValueError: it is no XML, or its root is called otherwise.
@@ -17,7 +17,7 @@ def read_xml(path: str | Path, root: str) -> ElementTree.Element:
         found = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, UnicodeDecodeError, LookupError) as error:
         raise ValueError(f"{path} is no XML file: {error}") from None
-    if found.tag != root:
+    if root is not None and found.tag != root:
         raise ValueError(f"{path} starts with <{found.tag}>: expected <{root}>.")
     return found
 
@@ -38,7 +38,7 @@ class Reader:
         return name in self.attributes
 
     def numbers(self, name: str, count: int, default: Iterable[float] | None = None) -> np.ndarray:
-        """`count` numbers, (count,); more are cut off only where `default` is given."""
+        """`count` numbers, (count,)."""
         text = self.text(name)
         if text is None:
             if default is None:

@@ -64,15 +64,20 @@ class Group:
 # ---- records in arrays
 
 
-def make_groups(found: Sequence[Run], slots: Sequence[Slot], shared: int, dt: float | None) -> list[Group]:
+def longest_step(found: Sequence[Run], dt: float | None) -> float:
+    """[s] as given; default the median of the intervals between times."""
+    if dt is not None:
+        return float(positive("dt", dt, "it is the longest step in s"))
+    return float(np.median(np.concatenate([np.diff(all_times(run)) for run in found])))
+
+
+def make_groups(found: Sequence[Run], slots: Sequence[Slot], shared: int, longest: float) -> list[Group]:
     """Records of one structure together.
 
     Args:
         shared: how many of the slots belong to all records.
-        dt: [s] longest step; default the median of the intervals between times.
+        longest: [s] the longest step allowed.
     """
-    gaps = np.concatenate([np.diff(_all_times(run)) for run in found])
-    longest = float(np.median(gaps)) if dt is None else float(positive("dt", dt, "it is the longest step in s"))
     keys: dict[Any, list[int]] = {}
     for index, run in enumerate(found):
         scene = (run.world, run.state, run.channels)
@@ -119,7 +124,7 @@ def _absent(slot: Slot) -> Slot:
     return Slot(slot.name, (), slot.kind, slot.size)
 
 
-def _all_times(run: Run) -> np.ndarray:
+def all_times(run: Run) -> np.ndarray:
     """Start and every measured time, once each."""
     t = np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
     return t[np.concatenate([[True], np.diff(t) > SAME])]
@@ -127,7 +132,7 @@ def _all_times(run: Run) -> np.ndarray:
 
 def _grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Lengths of the steps that land on every measured time, and for each column the state of each of its rows."""
-    t = _all_times(run)
+    t = all_times(run)
     gaps = np.diff(t)
     counts = np.maximum(np.ceil(gaps / longest - 1e-6), 1).astype(int)
     ends = np.concatenate([[0], np.cumsum(counts)])

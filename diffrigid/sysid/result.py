@@ -19,7 +19,8 @@ from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene, Slot, reference
-from diffrigid.sysid.records import runs, same_data
+from diffrigid.sysid.problem import all_times
+from diffrigid.sysid.records import SAME, runs, same_data
 from diffrigid.sysid.setup import (
     Problem,
     by_column,
@@ -98,8 +99,7 @@ class Fit:
     @property
     def t(self) -> np.ndarray:
         """(T+1,) [s] times of the first record, from its start on."""
-        run = self.problem.runs[0]
-        return np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
+        return all_times(self.problem.runs[0])
 
     @property
     def covariance(self) -> np.ndarray:
@@ -121,17 +121,22 @@ class Fit:
 
         Args:
             times: [s] increasing, the first at or after the start of the record; default its measured times.
-            dt: [s] longest step; default the longest interval between the measured times.
+            dt: [s] longest step; default that of the fit.
+
+        Raises:
+            ValueError: times begin before the record.
         """
         scene, run = self.scenes[record], self.problem.runs[record]
-        measured = np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
-        wanted = measured if times is None else np.asarray(times, float)
-        later = wanted if wanted[0] <= run.start else np.concatenate([[run.start], wanted])
-        longest = float(np.diff(measured).max()) if dt is None else dt
-        motion = rollout(scene.world, scene.state, dt=longest, times=later)
-        extra = len(later) - len(wanted)
+        wanted = all_times(run) if times is None else np.asarray(times, float)
+        if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME:
+            raise ValueError(
+                f"times is {times!r}: expected times from {run.start:g} s on, where record {record} starts"
+            )
+        extra = int(wanted[0] > run.start + SAME)
+        since = np.concatenate([np.zeros(extra), wanted - run.start])
+        motion = rollout(scene.world, scene.state, dt=self.problem.dt if dt is None else dt, times=since)
         state = jax.tree.map(lambda leaf: leaf[extra:], motion.state) if extra else motion.state
-        return Trajectory(t=motion.t[extra:], state=state, world=motion.world)
+        return Trajectory(t=wanted, state=state, world=motion.world)  # type: ignore[arg-type]
 
     def score(self, observations: Any, starts: int = 1, seed: int = 0) -> dict[str, float]:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
@@ -144,7 +149,7 @@ class Fit:
         fitted = [[k for k, run in enumerate(self.problem.runs) if same_data(run, other)] for other in scored]
         problem = make_problem(
             self.world, self.state, observations, free=free, observe=observe, resume=self.summary,
-            places=[found[0] if found else None for found in fitted],
+            dt=self.problem.dt, places=[found[0] if found else None for found in fitted],
         )  # fmt: skip
         problem = with_noise(problem, {name: self.noise.get(name, s) for name, s in problem.noise.items()})
         z, reach = make_starts(problem, starts, seed), reach_of(problem, range(problem.sizes[0]))

@@ -22,7 +22,7 @@ from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, Point
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
-from diffrigid.sysid.problem import Group, circular, evaluate, known, linearise, make_groups
+from diffrigid.sysid.problem import Group, circular, evaluate, known, linearise, longest_step, make_groups
 from diffrigid.sysid.records import Run, noise_guess, runs
 from diffrigid.world import World
 
@@ -37,6 +37,7 @@ class Problem:
     shared: tuple[Slot, ...]
     own: tuple[Slot, ...]
     groups: tuple[Group, ...]
+    dt: float  # [s] the longest step
     noise: dict[str, float]  # of columns whose noise is not given with their record
     free: Mapping[Any, Any]  # as the user gave it
     observe: Mapping[str, Any]  # likewise
@@ -70,8 +71,9 @@ def make_problem(
     if resume is not None:
         found = _resumed(found, resume, free, range(len(found)) if places is None else places)
     shared, own = make_slots(free, [scene_of(run) for run in found])
-    groups = make_groups(found, (*shared, *own), len(shared), dt)
-    problem = Problem(tuple(found), shared, own, tuple(groups), {}, dict(free), dict(observe or {}))
+    longest = longest_step(found, dt)
+    groups = make_groups(found, (*shared, *own), len(shared), longest)
+    problem = Problem(tuple(found), shared, own, tuple(groups), longest, {}, dict(free), dict(observe or {}))
     return with_noise(problem, _noise_guesses(found))
 
 
