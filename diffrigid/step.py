@@ -120,7 +120,8 @@ def missed_pairs(world: World, state: State, dt: Any) -> Array:
 
     In a crowd, 256 discs or spheres and more that no forces act on and that meet only each other and half-spaces,
     pairs are found by a grid, and each body has room for `Contact(neighbours=...)` others that it could touch within
-    the step. More are left out, and may be passed through: raise `neighbours`. Elsewhere every pair is tested.
+    the step at the speeds of its start. More are left out, and may be passed through: raise `neighbours`. Elsewhere
+    every pair is tested.
 
     Args:
         state: of one world, or with leading axes, as `rollout` and `rollout_batch` return it.

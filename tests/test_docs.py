@@ -1,5 +1,6 @@
 """The documentation site builds without a warning, names everything that is public, and loads nothing."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -39,6 +40,31 @@ def site(tmp_path_factory):
     built = subprocess.run(command, capture_output=True, text=True)
     assert built.returncode == 0 and not built.stderr, built.stderr
     return out
+
+
+def test_every_function_that_the_pages_name_is_there():
+    """Without the tools that build the site."""
+    text = "".join((ROOT / "notebooks" / f"{page}.md").read_text() for page in ("equations", "inside", "coming_from"))
+    named = re.findall(r"\{py:\w+\}`~?(diffrigid[\w.]*)`|auto(?:function|class):: (diffrigid[\w.]*)", text)
+    for module, members in re.findall(r"automodule:: (diffrigid[\w.]*)\n +:members: (.*)", text):
+        named += [(f"{module}.{member}", "") for member in members.split(", ")]
+    assert len(named) > 50
+    missing = [name for pair in named for name in pair if name and not found(name)]
+    assert missing == []
+
+
+def found(name):
+    """Whether there is such a module, or such a name in one."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            thing = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            thing = getattr(thing, part, None)
+        return thing is not None
+    return False
 
 
 @pytest.mark.slow

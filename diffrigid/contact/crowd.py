@@ -159,7 +159,7 @@ def _walls(world: Any, batch: tuple[int, ...]) -> list[Walls]:
 
 
 def _near(world: Any, crowd: Crowd, start: State) -> Near:
-    """The neighbours of each body that it can touch within the step."""
+    """The neighbours of each body that it can touch within the step, at the speeds of its start."""
     fastest = norm(start.v[0]).max()
     x, reach = start.x[0], crowd.shape.radius + fastest * crowd.dt
     return neighbours(x, jnp.broadcast_to(reach, x.shape[1:]), x.shape[1] // len(world.names), world.contact.neighbours)

@@ -74,14 +74,18 @@ def fit(
         widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets
             starts that miss an impact find it.
         windows: [s] of each record from its start, one fit after the other: (0.5, 1, 2, inf) leads into a long one.
-        loss: squares(), huber() or student().
-        solver: default Levenberg-Marquardt; `first_order(optax.adam(1e-2))` or `lbfgs()` for many numbers.
-        intervals: from_jacobian, sandwich or bootstrap.
+        loss: `diffrigid.sysid.squares()`, `dr.huber()` or `dr.student()`.
+        solver: default Levenberg-Marquardt; for many numbers `diffrigid.sysid.first_order(optax.adam(1e-2))` or
+            `diffrigid.sysid.lbfgs()`.
+        intervals: `diffrigid.sysid.from_jacobian`, `dr.sandwich` or `dr.bootstrap`.
+        iterations: of Levenberg-Marquardt at most, for each width and window.
         seed: of the random starts.
         resume: an earlier Fit, or what `load_fit` read: the first start is there.
         progress: print a line as it goes; default: if the output is a terminal or a notebook.
 
-    Interrupting it returns the best so far. Raises:
+    Interrupting it returns the best so far.
+
+    Raises:
         ValueError: unknown names, wrong shapes, or a parameter that nothing measured depends on.
 
     Example:
