@@ -18,11 +18,13 @@ from the velocities of the first two frames instead of fitted starts:
 
     as the source has it, restitution 0            65 +- 3 %, 72 +- 3 degrees, hinge 65 +- 4 degrees
     friction and restitution 0.15                  51 +- 2 %, 69 +- 3 degrees, hinge 60 +- 4 degrees
-    and ratio, inertia, damping of the flights     52 +- 3 %, 67 +- 3 degrees, hinge 56 +- 4 degrees
+    and ratio, inertia, damping of the flights,
+    and 0.005 N m of dry friction in the hinge     52 +- 3 %, 67 +- 3 degrees, hinge 56 +- 4 degrees
 
-The lower two were tried by hand: the search of the second stage has not been run to its end. From such starts the model
-is 5 degrees off at the first impact, and in the 15 frames after it 48 other values of all six numbers gave a mean of 27
-to 39 degrees (32 tosses): what they do at an impact seems to depend on where they are more than on these numbers.
+The lower two were tried by hand, with these tosses in view: the search of the second stage has not been run to its
+end. From such starts the model is 5 degrees off at the first impact, and in the 15 frames after it 48 other values of
+all six numbers gave a mean of 27 to 39 degrees (32 tosses): what they do at an impact seems to depend on where they
+are more than on these numbers.
 """
 
 import argparse
