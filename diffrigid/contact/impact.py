@@ -259,8 +259,8 @@ def _time_to(height: Array, v: Array, acc: Array) -> Array:
 def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array) -> tuple[Array, Array]:
     """Advance until a contact is near and closing, or the step is over; and which contacts (K, *batch) rest.
 
-    Those touch, or are about to, no faster than `slow` [m/s] or than would rest anyway. They are left out: in a flight
-    without support they would be the next to close, and hide the fast impact of another corner.
+    Those touch, or are about to, no faster than `slow` [m/s], or beside such a one no faster than would rest anyway.
+    They are left out: in a flight without support they would be the next to close, and hide the fast impact of another.
 
     Each advance is the least, over the contacts, of the gap over a bound on the closing speed for the present
     normal (Mirtich 1996), so that a body that only translates arrives in one. The gap of a corner and a plane is
@@ -299,9 +299,11 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array
         onward = jnp.where(s < t1, jnp.minimum(s + jnp.maximum(dt, 0.0), t1), s)
         gap, v, acc, normal = _motion(a, b, onward, live)
         square = v * v + 2.0 * jnp.maximum(gap, 0.0) * jnp.abs(acc)  # of the speed at which it touches
-        # What closes by a third of its fall would be back within the step, by any restitution.
+        touches = (gap <= near[None]) & (square <= slow[None] ** 2)
+        # Beside one that rests, what closes by a third of its fall: it would be back within the step, whatever e <= 1.
         least = slow[None] + jnp.maximum(-acc, 0.0) * span[None] / 3.0
-        rests = jnp.where(count == 0, (gap <= near[None]) & (square <= least**2), rests)
+        beside = (gap <= near[None]) & (square <= least**2) & touches.any(0)[None]
+        rests = jnp.where(count == 0, touches | beside, rests)
         return count + 1, onward, safe_time(gap, v, acc, normal, rests, onward), rests
 
     contacts = jax.eval_shape(lambda: _motion(a, b, start, live)[0]).shape
