@@ -73,11 +73,15 @@ def rollout_batch(
 
 def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -> Any:
     """Controls of the whole batch, with the batch last: (T, D or A, B), or 1 where they are alike."""
-    if not isinstance(controls, Mapping):
-        return as_controls(world.forces, controls, dtype, (steps,), (count,))
-    ranks = {name: np.ndim(value) for name, value in controls.items()}
-    last = {k: jnp.moveaxis(value, 0, -1) if ranks[k] == 3 else value for k, value in controls.items()}
-    return as_controls(world.forces, last, dtype, (steps,), (count,))
+    if isinstance(controls, Mapping):
+        names = controlled(world.forces)
+        controls = {k: _batch_last(value) if k in names else value for k, value in controls.items()}
+    return as_controls(world.forces, controls, dtype, (steps,), (count,))
+
+
+def _batch_last(value: Any) -> Any:
+    """(B, T, D or A) to (T, D or A, B); what is no batch of arrays stays."""
+    return jnp.moveaxis(value, 0, -1) if getattr(value, "ndim", 0) == 3 else value
 
 
 def _check_leaves(world: World, state: State) -> None:

@@ -12,14 +12,13 @@ Published on the same metric, tuned on 100 tosses and scored on 104 (Acosta, Yan
 11.7 % and 14.4 degrees at best; the noise of the start states alone costs about 4.6 % and 3.4 degrees.
 """
 
-import argparse
 import time
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scoring import open_loop, search, show
+from scoring import angle_between, arguments, open_loop, search, show
 
 import diffrigid as dr
 
@@ -56,7 +55,7 @@ def errors(record: dict):
     def of(values):
         x, q = simulate(values)
         distance = np.linalg.norm(x - record["x"], axis=-1) / (2 * record["half"]) * 100
-        angle = 2 * np.degrees(np.arccos(np.clip(np.abs((q * record["q"]).sum(-1)), 0, 1)))
+        angle = angle_between(q, record["q"])
         return np.stack([np.nanmean(distance, axis=2), np.nanmean(angle, axis=2)], axis=-1)
 
     return of
@@ -68,11 +67,7 @@ def loss(error):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--train", type=int, default=100)
-    parser.add_argument("--test", type=int, default=104)
-    args = parser.parse_args()
+    args = arguments(__doc__.splitlines()[0], DATA)
     began = time.perf_counter()
     record = tosses(args.data, slice(0, args.train))
     of = errors(record)

@@ -27,7 +27,6 @@ all six numbers gave a mean of 27 to 39 degrees (32 tosses): what they do at an 
 are more than on these numbers.
 """
 
-import argparse
 import functools
 import time
 from pathlib import Path
@@ -35,7 +34,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scoring import show
+from scoring import angle_between, arguments, show
 
 import diffrigid as dr
 from diffrigid import so3
@@ -260,14 +259,11 @@ def errors(record: dict, tensor: np.ndarray, starts: np.ndarray, damping: float)
         wanted = np.asarray(
             second(jnp.asarray(one), jnp.broadcast_to(jnp.asarray(record["angle"], one.dtype), one.shape[:3]))
         )
-        return np.stack([part.mean(2) for part in (distance, apart(one, record["q"]), apart(two, wanted))], axis=-1)
+        return np.stack(
+            [part.mean(2) for part in (distance, angle_between(one, record["q"]), angle_between(two, wanted))], axis=-1
+        )
 
     return of
-
-
-def apart(q, other):
-    """Angle between orientations (..., 4) [degrees]."""
-    return 2 * np.degrees(np.arccos(np.clip(np.abs((q * other).sum(-1)), 0, 1)))
 
 
 def search(of, tosses: int):
@@ -286,11 +282,7 @@ def search(of, tosses: int):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--train", type=int, default=100)
-    parser.add_argument("--test", type=int, default=104)
-    args = parser.parse_args()
+    args = arguments(__doc__.splitlines()[0], DATA)
     began, both = time.perf_counter(), slice(0, args.train + args.test)
     record, train = tosses(args.data, both), slice(0, args.train)
     flight, starts, draws = fit_flight(record, GUESS, UNIFORM, args.train)

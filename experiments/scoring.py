@@ -1,5 +1,8 @@
 """What the experiments with measured tosses share: simulation of all records, a search on a grid, and intervals."""
 
+import argparse
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,6 +60,20 @@ def search(loss, ranges, points=POINTS, finer=FINER):
     draws = np.random.default_rng(0).integers(count, size=(DRAWS, count))
     again = np.array([by_record[:, draw].mean(1).argmin() for draw in draws])
     return {name: (values[best], *np.quantile(values[again], [0.025, 0.975])) for name, values in fine.items()}
+
+
+def angle_between(q, other):
+    """Angle of the rotation from one orientation (..., 4) to another [degrees]."""
+    return 2 * np.degrees(np.arccos(np.clip(np.abs((q * other).sum(-1)), 0, 1)))
+
+
+def arguments(title, data, train=100, test=104):
+    """Of the command line: the file, and how many of its records are fitted, and how many then scored."""
+    parser = argparse.ArgumentParser(description=title)
+    parser.add_argument("--data", type=Path, default=data)
+    parser.add_argument("--train", type=int, default=train)
+    parser.add_argument("--test", type=int, default=test)
+    return parser.parse_args()
 
 
 def _grid(axes):

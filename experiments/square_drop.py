@@ -10,13 +10,12 @@ to a horizon of the distance, in per cent of the side, and of the angle between 
 Box2D, tuned on the same record: 11.7 % and 19.6 degrees up to 0.1 s, 24.2 and 41.7 to 0.2 s, 40.0 and 69.7 to 0.4 s.
 """
 
-import argparse
 import time
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from scoring import open_loop, search, show
+from scoring import arguments, open_loop, search, show
 
 import diffrigid as dr
 
@@ -69,11 +68,7 @@ def errors(record: dict):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--train", type=int, default=100)
-    parser.add_argument("--test", type=int, default=100)
-    args = parser.parse_args()
+    args = arguments(__doc__.splitlines()[0], DATA, test=100)
     began = time.perf_counter()
     of = errors(drops(args.data, slice(0, args.train)))
     found = search(lambda values: (of(values) / PEERS).mean((-2, -1)), RANGES)

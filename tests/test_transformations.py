@@ -8,6 +8,7 @@ from closed_form import BALL, CASES, bouncing, disc_and_plane, made, numpy_motio
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid.pytree import pytree
 from diffrigid.step import _rollout_jit, _step_jit
 
 ROUNDING = 1e-11  # absolute, of values about 1: the same operations in another order
@@ -186,6 +187,23 @@ def test_controls_of_a_batch():
     first = dr.step(world, last, 0.1, {"push": jnp.moveaxis(push[:, 0], 0, -1)}).v
     assert_allclose(first, trailing[1], rtol=EXACT)
     assert_allclose(dr.rollout(world, last, controls={"push": push[0]}, **run).state.v[..., 0], alone[0], rtol=EXACT)
+
+
+@pytree
+class Wind:
+    """A force of one's own, which reads a matrix for each step."""
+
+    def __call__(self, bodies, state, controls):
+        return dr.Wrench(F=jnp.broadcast_to(jnp.diag(controls["axes"])[None, :, None] * state.v, state.v.shape))
+
+
+def test_a_batch_leaves_controls_of_other_forces_as_they_are():
+    """Those have the axes that their force asks for: three are no batch."""
+    world, state = dr.scene({"ball": PUCK}, forces=[Wind()])
+    states, run = dr.replace(state, v=jnp.ones((3, 1, 2))), {"dt": 0.1, "steps": 5}
+    axes = jnp.broadcast_to(jnp.diag(jnp.array([-1.0, 2.0])), (5, 2, 2))
+    v = dr.rollout_batch(world, states, controls={"axes": axes}, final_only=True, **run).v
+    assert_allclose(v[:, 0], np.broadcast_to(np.exp(np.array([-1.0, 2.0]) * 0.5 / PUCK.mass), (3, 2)), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

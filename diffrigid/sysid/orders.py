@@ -13,6 +13,7 @@ from diffrigid.impacts import order_of_impacts
 from diffrigid.step import Trajectory
 from diffrigid.sysid.levenberg import Numbers
 from diffrigid.sysid.problem import LOOKED_AT, linearise
+from diffrigid.sysid.records import SAME
 from diffrigid.sysid.setup import Problem, fitted_scene
 
 NAMED, LISTED = 3, 8  # orders that are written out, and pairs of each
@@ -37,7 +38,7 @@ def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
             run, lengths = problem.runs[group.members[k]], np.asarray(group.data.lengths, float)
             t = np.concatenate([[0.0], np.cumsum(lengths[:, k if lengths.shape[1] > 1 else 0])])
             end = max(series.t[-1] for series in run.series) - run.start
-            t = t[t <= end + 1e-9]  # shorter records are padded
+            t = t[t <= end + SAME]  # shorter records are padded
             for start in range(starts):
                 scene = fitted_scene(problem, group, k, shared[:, start], own[..., start])
                 lane = (slice(len(t)), ..., k, start)
