@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from diffrigid.compiling import uncollected
 from diffrigid.controls import as_controls, controlled
 from diffrigid.devices import cut, devices, join, over_devices, pieces_of
 from diffrigid.pytree import map_arrays
@@ -134,6 +135,7 @@ def _batch_axes(world: World, controls: Any, count: int) -> list[int | None]:
 
 
 @jax.jit(static_argnames=("steps", "final_only", "count", "pieces", "memory"))
+@uncollected
 def _run(world, state, controls, dt, steps, final_only, count, pieces, memory):
     leaves, tree = jax.tree.flatten((world, state, controls))
     batched = jax.tree.leaves(map_arrays(lambda leaf, letters, _: leaf.ndim > len(letters), (world, state)))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.compiling import uncollected
 from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
 from diffrigid.convert import largest, numbers
@@ -213,17 +214,20 @@ def aligned(world: World, state: State) -> tuple[World, State]:
 
 
 @jax.jit
+@uncollected
 def _missed_jit(world, states, dt):
     return lax.map(lambda state: without_room(world, state, dt), states)
 
 
 @jax.jit
+@uncollected
 def _step_jit(world, state, dt, controls):
     world, state = aligned(world, state)
     return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
 
 
 @jax.jit(static_argnames=("counts", "memory"))
+@uncollected
 def _rollout_jit(world, state, intervals, controls, counts, memory):
     return scan_steps(*aligned(world, state), intervals, controls, counts, memory)
 

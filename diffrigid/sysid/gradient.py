@@ -14,8 +14,9 @@ import numpy as np
 import optax
 from jax import Array
 
+from diffrigid.compiling import QUICK, uncollected
 from diffrigid.sysid.levenberg import Numbers, Point, point_at
-from diffrigid.sysid.problem import QUICK, Group, Plan, residuals_of
+from diffrigid.sysid.problem import Group, Plan, residuals_of
 
 ARMIJO = 1e-4  # [-] of the decrease that the slope promises: what a step of L-BFGS has to achieve
 HALVINGS = 20
@@ -80,6 +81,7 @@ def cost_and_slope(groups: Sequence[Group], z: Numbers, loss: Any) -> tuple[Arra
 
 
 @partial(jax.jit, static_argnames=("plan", "loss"), compiler_options=QUICK)
+@uncollected
 def _group_slope(plan: Plan, loss: Any, z: Array, data: Any) -> tuple[Array, Array]:
     def cost(z):
         by_start = loss.rho(residuals_of(plan, z, data)).sum((0, 1))

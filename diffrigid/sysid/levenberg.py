@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from diffrigid.compiling import QUICK
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.problem import QUICK, Group, linearise
+from diffrigid.sysid.problem import Group, linearise
 
 STIFF = 1e7  # a damping at which no step is taken any more
 SMALL = 1e-9  # a decrease still to be had, relative to the cost of one residual, that is nothing

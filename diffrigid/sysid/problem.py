@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid import paths
+from diffrigid.compiling import QUICK, uncollected
 from diffrigid.convert import positive
 from diffrigid.devices import cut, devices, everywhere, join, over_devices, pieces_of
 from diffrigid.state import State
@@ -28,7 +29,6 @@ from diffrigid.sysid.records import SAME, Run, Series
 from diffrigid.sysid.sensors import Part, difference
 
 LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are looked at
-QUICK = {"xla_cpu_use_fusion_emitters": False}  # half the time to compile; a quarter slower to run where large
 
 
 @dataclass(frozen=True)
@@ -268,8 +268,8 @@ def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
     return residuals(plan, z.reshape(n, -1), _spread(data, 1, S)).reshape(-1, R, S)
 
 
-linearise = jax.jit(linearised, static_argnames="plan", compiler_options=QUICK)
-evaluate = jax.jit(residuals_of, static_argnames="plan", compiler_options=QUICK)
+linearise = jax.jit(uncollected(linearised), static_argnames="plan", compiler_options=QUICK)
+evaluate = jax.jit(uncollected(residuals_of), static_argnames="plan", compiler_options=QUICK)
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:

@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from diffrigid.compiling import QUICK, uncollected
 from diffrigid.step import at_least_one
 from diffrigid.sysid.covariance import inverse
 from diffrigid.sysid.diagnosis import coordinates
 from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of
 from diffrigid.sysid.parameters import Slot, reference, split
-from diffrigid.sysid.problem import QUICK, Data, Plan, linearised
+from diffrigid.sysid.problem import Data, Plan, linearised
 from diffrigid.sysid.result import Fit, references, unit_of
 from diffrigid.sysid.setup import Problem, scene_of
 from diffrigid.sysid.summary import Parameter
@@ -135,6 +136,7 @@ def _covariance(fit: Fit) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnames=("nuts", "parts", "shared", "own", "loss", "counts"), compiler_options=QUICK)
+@uncollected
 def _chains(
     nuts: Any, parts: tuple[tuple[Plan, tuple[int, ...]], ...], shared: tuple[Slot, ...], own: tuple[Slot, ...],
     loss: Any, counts: tuple[int, int], keys: Array, first: Array, covariance: Array, data: tuple[Data, ...],
