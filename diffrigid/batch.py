@@ -26,6 +26,7 @@ LANES = 2**15
 CORNER = 32  # lanes of a contact of shapes with corners: it is searched for, and is rarely alone
 
 
+@uncollected
 def rollout_batch(
     world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, controls: Any = None,
     chunk: int | None = None, memory: int = MEMORY,
@@ -135,7 +136,6 @@ def _batch_axes(world: World, controls: Any, count: int) -> list[int | None]:
 
 
 @jax.jit(static_argnames=("steps", "final_only", "count", "pieces", "memory"))
-@uncollected
 def _run(world, state, controls, dt, steps, final_only, count, pieces, memory):
     leaves, tree = jax.tree.flatten((world, state, controls))
     batched = jax.tree.leaves(map_arrays(lambda leaf, letters, _: leaf.ndim > len(letters), (world, state)))

@@ -7,7 +7,7 @@ A trajectory stores states, not impulses, so they are inferred, one interval bet
     impulses       the smallest that, at these points and in the joints, explain the changes of momentum and angular
                    momentum beyond what the forces do in the interval (least norm: where points share a load, equally)
 
-What touches a `Profile` is not found. Forces by `controls`, which a trajectory does not store, are taken for contact.
+What touches a `Profile` is not found.
 Exact for a body with one contact.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from diffrigid.forces import total_wrench
 from diffrigid.hull import hull_faces
-from diffrigid.pytree import align, replace
+from diffrigid.pytree import replace
 from diffrigid.shapes import UNEVEN, HalfSpace, edges, radius, vertices
 from diffrigid.state import momentum, spin
 from diffrigid.step import Trajectory
@@ -107,7 +107,8 @@ def _thinned(trajectory: Trajectory) -> Trajectory:
     pairs = sum(len(group.a) for group in trajectory.world.pairs)
     every = 1 + pairs * len(trajectory.t) // WORK
     t, state = jax.tree.map(lambda leaf: np.asarray(leaf, float)[::every], (trajectory.t, trajectory.state))
-    return replace(trajectory, t=t, state=state)
+    controls = jax.tree.map(lambda leaf: leaf[::every][: len(t) - 1], trajectory.controls)
+    return replace(trajectory, t=t, state=state, controls=controls)
 
 
 def _motion(trajectory: Trajectory) -> Motion:
@@ -124,21 +125,22 @@ def _motion(trajectory: Trajectory) -> Motion:
 def _changes(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """By interval and body: change of momentum (T, N, D) and of angular momentum (T, N, A) beyond that of the forces,
     and the size of what the forces did, (T, N), all [N s]."""
-    dtype = trajectory.world.bodies.mass.dtype
-    state = jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1).astype(dtype), trajectory.state)
-    bodies, h = align(trajectory.world.bodies, 1), np.diff(trajectory.t)[:, None, None]
-    forces = tuple(replace(f, control=None) if getattr(f, "control", None) else f for f in trajectory.world.forces)
-    wrench = total_wrench(align(forces, 1), bodies, state, None)
-    p, L = (np.moveaxis(np.asarray(leaf, float), -1, 0) for leaf in (momentum(bodies, state), spin(bodies, state)))
+    bodies, h = trajectory.world.bodies, np.diff(trajectory.t)[:, None, None]
+    state = jax.tree.map(lambda leaf: leaf.astype(bodies.mass.dtype), trajectory.state)
+    p, L = (np.asarray(jax.vmap(of, (None, 0))(bodies, state), float) for of in (momentum, spin))
 
-    def added(force, like):
-        if force is None:
-            return np.zeros_like(like[1:])
-        force = np.moveaxis(np.broadcast_to(np.asarray(force, float), (*like.shape[1:], len(like))), -1, 0)
-        return h * (force[1:] + force[:-1]) / 2
+    def wrench(state, controls):
+        return total_wrench(trajectory.world.forces, bodies, state, controls)
 
-    F = added(wrench.F, p)
-    return np.diff(p, axis=0) - F, np.diff(L, axis=0) - added(wrench.tau, L), np.linalg.norm(F, axis=2)
+    ends = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], state) for rows in (slice(None, -1), slice(1, None))]
+    at_ends = [jax.vmap(wrench)(end, trajectory.controls) for end in ends]
+
+    def added(name, like):
+        forces = [getattr(found, name) for found in at_ends]
+        return np.zeros_like(like[1:]) if forces[0] is None else h * np.asarray(forces[0] + forces[1], float) / 2
+
+    F = added("F", p)
+    return np.diff(p, axis=0) - F, np.diff(L, axis=0) - added("tau", L), np.linalg.norm(F, axis=2)
 
 
 def _touches(world: World, group: Any, motion: Motion, dp: np.ndarray, dL: np.ndarray, push: np.ndarray) -> Touch:

@@ -26,7 +26,7 @@ MEMORY = 2**31  # [bytes] of states that reverse mode saves before it rather com
 
 @pytree
 class Trajectory:
-    """States at the T + 1 times of a rollout; every leaf of `state` has a leading time axis.
+    """States at the T + 1 times of a rollout; every leaf of `state` has a leading time axis, and of `controls`, of T.
 
     Example:
         >>> trajectory.t.shape, trajectory.state.x.shape  # the start and 30 steps
@@ -36,6 +36,7 @@ class Trajectory:
     t: Array = array("T")  # (T+1,) [s], from 0, or the given times
     state: State
     world: World
+    controls: Any = None  # as given, over each interval
 
     def _repr_html_(self) -> str | None:
         """The motion itself, in a notebook; a batch is shown as text."""
@@ -47,6 +48,7 @@ class Trajectory:
             return None
 
 
+@uncollected
 def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
     """State after dt [s].
 
@@ -70,6 +72,7 @@ def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
     return _step_jit(world, state, step_length(dt, state, batch=True), controls)
 
 
+@uncollected
 def rollout(
     world: World, state: State, *, dt: Any, steps: int | None = None, times: Any = None,
     substeps: tuple[int, ...] | None = None, controls: Any = None, memory: int = MEMORY,
@@ -107,13 +110,14 @@ def rollout(
         t = longest * jnp.arange(count + 1, dtype=longest.dtype)
         controls = as_controls(world.forces, controls, state.x.dtype, (count,), state.x.shape[2:])
         states = _rollout_jit(world, state, jnp.broadcast_to(longest, (count,)), controls, (1,) * count, memory)
-        return Trajectory(t=t, state=states, world=world)
+        return Trajectory(t=t, state=states, world=world, controls=controls)
     t = jnp.asarray(numbers("times", times, None), state.x.dtype)
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
     controls = as_controls(world.forces, controls, state.x.dtype, (len(t) - 1,), state.x.shape[2:])
     counts = _substeps(t, longest) if substeps is None else _given_substeps(substeps, t.shape[0] - 1)
-    return Trajectory(t=t, state=_rollout_jit(world, state, jnp.diff(t), controls, counts, memory), world=world)
+    states = _rollout_jit(world, state, jnp.diff(t), controls, counts, memory)
+    return Trajectory(t=t, state=states, world=world, controls=controls)
 
 
 def missed_pairs(world: World, state: State, dt: Any) -> Array:
@@ -214,20 +218,17 @@ def aligned(world: World, state: State) -> tuple[World, State]:
 
 
 @jax.jit
-@uncollected
 def _missed_jit(world, states, dt):
     return lax.map(lambda state: without_room(world, state, dt), states)
 
 
 @jax.jit
-@uncollected
 def _step_jit(world, state, dt, controls):
     world, state = aligned(world, state)
     return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
 
 
 @jax.jit(static_argnames=("counts", "memory"))
-@uncollected
 def _rollout_jit(world, state, intervals, controls, counts, memory):
     return scan_steps(*aligned(world, state), intervals, controls, counts, memory)
 

@@ -1,5 +1,7 @@
 """States at times that lie between those of a simulation and may be free."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -10,14 +12,14 @@ from diffrigid.step import advance
 from diffrigid.world import World
 
 
-def states_at(world: World, states: State, lengths: Array, times: Array) -> State:
+def states_at(world: World, states: State, lengths: Array, controls: Any, times: Array) -> State:
     """States at times (K, 1 or B) [s] since the first, from those after each step.
 
     One more step, of the time that is missing, from the state before; so that what happens within it, an impact too, is
     felt, and the derivative by the time is the velocity. Before the start, the free flight that leads to it.
 
     Args:
-        states: (S+1, N, ..., B). lengths: (S, B) [s].
+        states: (S+1, N, ..., B). lengths: (S, B) [s]. controls: of each step, (S, size, 1 or B) by name.
 
     Returns:
         (K, N, ..., B).
@@ -38,13 +40,14 @@ def states_at(world: World, states: State, lengths: Array, times: Array) -> Stat
     def again(leaf: Array) -> Array:
         return leaf if leaf.shape[-1] == 1 else jnp.tile(leaf, len(times))
 
-    def pick(leaf: Array) -> Array:
-        return flat(jnp.take_along_axis(leaf, before.reshape(len(before), *[1] * (leaf.ndim - 2), -1), axis=0))
+    def pick(leaf: Array, row: Array) -> Array:
+        return flat(jnp.take_along_axis(leaf, row.reshape(len(row), *[1] * (leaf.ndim - 2), -1), axis=0))
 
-    start, worlds = jax.tree.map(pick, states), jax.tree.map(again, world)
+    start, worlds = jax.tree.map(lambda leaf: pick(leaf, before), states), jax.tree.map(again, world)
+    acting = jax.tree.map(lambda leaf: pick(leaf, jnp.minimum(before, count - 1)), controls)
     dt = jnp.where(late, missing, lengths[0]).reshape(-1)
-    after = advance(worlds, start, dt, None)
-    flight = launch(worlds, start, None, jnp.zeros((start.x.shape[0], dt.shape[0]), dt.dtype), dt)
+    after = advance(worlds, start, dt, acting)
+    flight = launch(worlds, start, acting, jnp.zeros((start.x.shape[0], dt.shape[0]), dt.dtype), dt)
     earlier = state_at(flight, jnp.where(late, 0.0, missing).reshape(-1))
 
     def choose(a: Array, b: Array) -> Array:

@@ -63,7 +63,8 @@ def fit(
     Args:
         observations: "t" [s] and columns "body.x", "body.v", "body.angle", "body.q", "body.w", arrays of K rows, or a
             table or CSV file with columns "t", "body.x[0]", ...; NaN is missing. A column with times of its own is a
-            pair (t, values). The first time is that of `state`. A list of such, or of `Record`, is fitted together.
+            pair (t, values). The first time is that of `state`. A column with the name of a `control` of a force is
+            what acts, each value until the next. A list of such, or of `Record`, is fitted together.
         free: what may vary: a path (see `diffrigid.paths` and `diffrigid.sysid.sensors`), or a tuple of paths that
             share one value. `each(kind)` gives every record its own.
         starts: the first is at the values of `world` and `state`, the others are random.

@@ -80,8 +80,8 @@ def cost_and_slope(groups: Sequence[Group], z: Numbers, loss: Any) -> tuple[Arra
     return jnp.where(jnp.isfinite(total), total, jnp.inf), Numbers(shared, own)
 
 
-@partial(jax.jit, static_argnames=("plan", "loss"), compiler_options=QUICK)
 @uncollected
+@partial(jax.jit, static_argnames=("plan", "loss"), compiler_options=QUICK)
 def _group_slope(plan: Plan, loss: Any, z: Array, data: Any) -> tuple[Array, Array]:
     def cost(z):
         by_start = loss.rho(residuals_of(plan, z, data)).sum((0, 1))

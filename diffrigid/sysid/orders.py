@@ -15,6 +15,7 @@ from diffrigid.sysid.levenberg import Numbers
 from diffrigid.sysid.problem import LOOKED_AT, linearise
 from diffrigid.sysid.records import SAME
 from diffrigid.sysid.setup import Problem, fitted_scene
+from diffrigid.sysid.times import controls_over
 
 NAMED, LISTED = 3, 8  # orders that are written out, and pairs of each
 
@@ -39,11 +40,12 @@ def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
             t = np.concatenate([[0.0], np.cumsum(lengths[:, k if lengths.shape[1] > 1 else 0])])
             end = max(series.t[-1] for series in run.series) - run.start
             t = t[t <= end + SAME]  # shorter records are padded
+            controls = controls_over(run, run.start + t[:-1])
             for start in range(starts):
                 scene = fitted_scene(problem, group, k, shared[:, start], own[..., start])
                 lane = (slice(len(t)), ..., k, start)
                 state = jax.tree.map(lambda leaf, lane=lane: leaf[lane], states)
-                motion = Trajectory(t=t, state=state, world=scene.world)
+                motion = Trajectory(t=t, state=state, world=scene.world, controls=controls)
                 found[start, group.members[k]] = order_of_impacts(motion)
     return tuple(tuple(found[start, record] for record in range(records)) for start in range(starts))
 

@@ -19,14 +19,14 @@ from jax import Array
 
 from diffrigid import paths
 from diffrigid.compiling import QUICK, uncollected
-from diffrigid.convert import positive
 from diffrigid.devices import cut, devices, everywhere, join, over_devices, pieces_of
 from diffrigid.state import State
 from diffrigid.step import aligned, scan_steps
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
-from diffrigid.sysid.records import SAME, Run, Series
+from diffrigid.sysid.records import Run, Series
 from diffrigid.sysid.sensors import Part, difference
+from diffrigid.sysid.times import controls_over, grid
 
 LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are looked at
 
@@ -47,6 +47,7 @@ class Data(NamedTuple):
     lengths: Any  # (S, R) [s] of the steps
     rows: dict[str, Array]  # (K, R) state of each row of a column
     times: dict[str, Array]  # (K, R) [s] since the start, of columns that are clocked
+    controls: dict[str, Array] | None  # (S, D or A, R) over each step
     measured: dict[str, Array]  # (K, size, R)
     weights: dict[str, Array]  # (K, size of the residual, R) 1 / standard deviation, 0 where missing
     width: Any  # () [m] of smooth impacts
@@ -62,13 +63,6 @@ class Group:
 
 
 # ---- records in arrays
-
-
-def longest_step(found: Sequence[Run], dt: float | None) -> float:
-    """[s] as given; default the median of the intervals between times."""
-    if dt is not None:
-        return float(positive("dt", dt, "it is the longest step in s"))
-    return float(np.median(np.concatenate([np.diff(all_times(run)) for run in found])))
 
 
 def make_groups(found: Sequence[Run], slots: Sequence[Slot], shared: int, longest: float) -> list[Group]:
@@ -97,9 +91,10 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
         for name in found[0].channels
         if {f"{name}.clock", "clock"} & freed or any(float(run.channels[name].clock) != 0 for run in found)
     )
-    grids = [_grid(run, longest) for run in found]
+    grids = [grid(run, longest) for run in found]
     steps = max(len(lengths) for lengths, _ in grids)
     lengths = [np.concatenate([a, np.full(steps - len(a), longest)]) for a, _ in grids]
+    acting = [controls_over(run, run.start + np.cumsum(h) - h) for run, h in zip(found, lengths, strict=True)]
     names = list(found[0].channels)
     rows = {name: max(len(_series(run, name).t) for run in found) for name in names}
 
@@ -111,6 +106,7 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
         lengths=_side_by_side(lengths),
         rows=stacked(lambda k, name: grids[k][1][name]),
         times={k: v for k, v in stacked(lambda k, n: _series(found[k], n).t - found[k].start).items() if k in clocked},
+        controls=jax.tree.map(lambda *values: _side_by_side(values), *acting),
         measured=stacked(lambda k, name: np.nan_to_num(_series(found[k], name).values)),
         weights=stacked(lambda k, name: known(found[k], name).astype(float)),
         width=np.zeros(()),
@@ -122,22 +118,6 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
 def _absent(slot: Slot) -> Slot:
     """The place of a parameter in z, for scenes that do not have it."""
     return Slot(slot.name, (), slot.kind, slot.size)
-
-
-def all_times(run: Run) -> np.ndarray:
-    """Start and every measured time, once each."""
-    t = np.unique(np.concatenate([[run.start], *(series.t for series in run.series)]))
-    return t[np.concatenate([[True], np.diff(t) > SAME])]
-
-
-def _grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Lengths of the steps that land on every measured time, and for each column the state of each of its rows."""
-    t = all_times(run)
-    gaps = np.diff(t)
-    counts = np.maximum(np.ceil(gaps / longest - 1e-6), 1).astype(int)
-    ends = np.concatenate([[0], np.cumsum(counts)])
-    index = {s.name: ends[np.clip(np.searchsorted(t, s.t - SAME), 0, len(t) - 1)] for s in run.series}
-    return np.repeat(gaps / counts, counts), index
 
 
 def _series(run: Run, name: str) -> Series:
@@ -206,11 +186,11 @@ def _simulated_here(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
     world, _ = paths.write(scene.world, scene.state, "contact.width", data.width)
     world, start = aligned(world, scene.state)
     lengths = jnp.broadcast_to(data.lengths, (data.lengths.shape[0], lanes))
-    states = scan_steps(world, start, lengths, None, (1,) * lengths.shape[0])
+    states = scan_steps(world, start, lengths, data.controls, (1,) * lengths.shape[0])
     rows = []
     for name, channel in scene.channels.items():
         if name in plan.clocked:
-            seen = states_at(world, states, lengths, data.times[name] - channel.clock[None])
+            seen = states_at(world, states, lengths, data.controls, data.times[name] - channel.clock[None])
         else:
             seen = jax.tree.map(lambda leaf, index=data.rows[name]: _pick(leaf, index), states)
         away = difference(channel, seen, data.measured[name]) * data.weights[name]
@@ -268,8 +248,8 @@ def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
     return residuals(plan, z.reshape(n, -1), _spread(data, 1, S)).reshape(-1, R, S)
 
 
-linearise = jax.jit(uncollected(linearised), static_argnames="plan", compiler_options=QUICK)
-evaluate = jax.jit(uncollected(residuals_of), static_argnames="plan", compiler_options=QUICK)
+linearise = uncollected(jax.jit(linearised, static_argnames="plan", compiler_options=QUICK))
+evaluate = uncollected(jax.jit(residuals_of, static_argnames="plan", compiler_options=QUICK))
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from diffrigid.controls import controlled
 from diffrigid.convert import known_number
 from diffrigid.state import State
 from diffrigid.sysid.sensors import Channel, Part, channel_of
@@ -43,7 +44,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Series:
-    """One measured column."""
+    """One measured column, or a control."""
 
     name: str
     t: np.ndarray  # (K,) [s], increasing
@@ -60,6 +61,7 @@ class Run:
     series: tuple[Series, ...]
     start: float  # [s]
     noise: Mapping[str, Any]
+    controls: tuple[Series, ...] = ()  # each held from one of its times to the next
 
 
 def runs(world: World, state: State, observations: Any, observe: Mapping[str, Any], noise: Mapping | None) -> list[Run]:
@@ -84,7 +86,7 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
         own_state = state if record.state is None else record.state
         check_mapping(f"{where}.noise", record.noise)
         check(own_world, own_state)
-        series, channels = columns(own_world, record.observations, observe, where)
+        series, channels, controls = columns(own_world, record.observations, observe, where)
         names = [s.name for s in series]
         if unknown := set(record.noise or {}) - set(names):
             raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
@@ -95,7 +97,15 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
             raise ValueError(
                 f"{where}: start is {start:g} s, after the first measured time {first:g} s: make it earlier"
             )
-        found.append(Run(own_world, own_state, channels, series, start, given))
+        if missing := controlled(own_world.forces).keys() - {control.name for control in controls}:
+            raise ValueError(f"{where} has no column {min(missing)!r}, which a force takes as its control")
+        for control in controls:
+            if control.t[0] > start + SAME:
+                raise ValueError(
+                    f"{where}[{control.name!r}] begins at {control.t[0]:g} s, after the start {start:g} s: what acts "
+                    "before?"
+                )
+        found.append(Run(own_world, own_state, channels, series, start, given, controls))
     everywhere = sorted({s.name for run in found for s in run.series})
     if unknown := set(noise or {}) - set(everywhere):
         raise ValueError(f"noise: no column {sorted(unknown)[0]!r} in observations, there are {everywhere}")
@@ -114,8 +124,8 @@ def same_data(one: Run, other: Run) -> bool:
 
 def columns(
     world: World, observations: Any, observe: Mapping[str, Any], where: str = "observations"
-) -> tuple[tuple[Series, ...], dict[str, Channel]]:
-    """Columns of a record, and what each observes.
+) -> tuple[tuple[Series, ...], dict[str, Channel], tuple[Series, ...]]:
+    """Columns of a record, what each observes, and the controls among them, which have the names that forces give.
 
     Args:
         observations: a mapping or a table (anything with `columns`), or the path of a CSV file. "t" (K,) [s], and by
@@ -131,15 +141,20 @@ def columns(
     gathered = _gather(table)
     if shared is None and not any(isinstance(values, tuple) for values in gathered.values()):
         raise ValueError(f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours')
-    found, channels = [], {}
+    found, channels, controls, sizes = [], {}, [], controlled(world.forces)
     for name, values in gathered.items():
-        channel = channel_of(name, observe.get(name, name), world)
         if isinstance(values, tuple) and len(values) == 2:
             t, values = _times(values[0], f"{where}[{name!r}]"), values[1]
         elif shared is not None:
             t = shared
         else:
             raise ValueError(f'{where}: expected a column "t" of times [s], got {sorted(gathered)}')
+        if name in sizes:
+            controls.append(Series(name, t, _filled(values, len(t), sizes[name], f"{where}[{name!r}]", world)))
+            if not np.isfinite(controls[-1].values).all():
+                raise ValueError(f"{where}[{name!r}] has NaN: expected numbers, for a control acts all the time")
+            continue
+        channel = channel_of(name, observe.get(name, name), world)
         values = _filled(values, len(t), channel.bias.shape[0], f"{where}[{name!r}]", world)
         found.append(Series(name, t, values))
         channels[name] = channel
@@ -148,7 +163,7 @@ def columns(
     if not found:
         raise ValueError(f"{where}: nothing is measured, there is no column beside the times")
     _refuse_units(found, channels, where)
-    return tuple(found), channels
+    return tuple(found), channels, tuple(controls)
 
 
 def read_csv(path: str | Path) -> dict[str, np.ndarray]:

@@ -12,14 +12,13 @@ import numpy as np
 
 from diffrigid.paths import unit
 from diffrigid.state import State
-from diffrigid.step import Trajectory, rollout
+from diffrigid.step import Trajectory
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
 from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene, Slot, reference
-from diffrigid.sysid.problem import all_times
 from diffrigid.sysid.records import SAME, runs, same_data
 from diffrigid.sysid.setup import (
     Problem,
@@ -33,6 +32,7 @@ from diffrigid.sysid.setup import (
 )
 from diffrigid.sysid.summary import Parameter, Summary
 from diffrigid.sysid.table import html_table, text_table
+from diffrigid.sysid.times import all_times, motion
 from diffrigid.world import World
 
 SCORED = 30  # iterations for the numbers of a record that was held out
@@ -128,15 +128,11 @@ class Fit:
         """
         scene, run = self.scenes[record], self.problem.runs[record]
         wanted = all_times(run) if times is None else np.asarray(times, float)
-        if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME:
+        if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME or not (np.diff(wanted) > 0).all():
             raise ValueError(
-                f"times is {times!r}: expected times from {run.start:g} s on, where record {record} starts"
+                f"times is {times!r}: expected increasing times from {run.start:g} s on, where record {record} starts"
             )
-        extra = int(wanted[0] > run.start + SAME)
-        since = np.concatenate([np.zeros(extra), wanted - run.start])
-        motion = rollout(scene.world, scene.state, dt=self.problem.dt if dt is None else dt, times=since)
-        state = jax.tree.map(lambda leaf: leaf[extra:], motion.state) if extra else motion.state
-        return Trajectory(t=wanted, state=state, world=motion.world)  # type: ignore[arg-type]
+        return motion(scene, run, wanted, self.problem.dt if dt is None else dt)
 
     def score(self, observations: Any, starts: int = 1, seed: int = 0) -> dict[str, float]:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.

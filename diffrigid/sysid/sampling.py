@@ -135,8 +135,8 @@ def _covariance(fit: Fit) -> np.ndarray:
 # ---- the density, of all chains at once
 
 
-@partial(jax.jit, static_argnames=("nuts", "parts", "shared", "own", "loss", "counts"), compiler_options=QUICK)
 @uncollected
+@partial(jax.jit, static_argnames=("nuts", "parts", "shared", "own", "loss", "counts"), compiler_options=QUICK)
 def _chains(
     nuts: Any, parts: tuple[tuple[Plan, tuple[int, ...]], ...], shared: tuple[Slot, ...], own: tuple[Slot, ...],
     loss: Any, counts: tuple[int, int], keys: Array, first: Array, covariance: Array, data: tuple[Data, ...],

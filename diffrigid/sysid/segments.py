@@ -13,6 +13,7 @@ with growing `windows` starts from there, and ends in one motion without jumps. 
 Source: Bock 1981, multiple shooting for parameter identification.
 """
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -22,12 +23,13 @@ import numpy as np
 
 from diffrigid import paths
 from diffrigid.state import State, rotations
-from diffrigid.step import at_least_one, rollout
+from diffrigid.step import at_least_one
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import Each, each, real, rotation
 from diffrigid.sysid.records import Record, Series, columns
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.sensors import Part
+from diffrigid.sysid.times import motion
 from diffrigid.world import World, check
 
 FRAMES = 5  # rows of a column that a guess of its start is made from
@@ -43,7 +45,7 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
     """
     check(world, state)
     at_least_one("count", count)
-    series, channels = columns(world, observations, {})
+    series, channels, controls = columns(world, observations, {})
     if count > max(len(s.t) for s in series):
         raise ValueError(f"count is {count}: expected at most as many segments as there are times")
     first, last = min(s.t[0] for s in series), max(s.t[-1] for s in series)
@@ -53,6 +55,7 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
         start = max(s.t[s.t <= start + 1e-9][-1] for s in series if (s.t <= start + 1e-9).any())
         use = {s.name: (s.t >= start - 1e-9) & (s.t <= end + 1e-9) for s in series}
         pieces = {s.name: (s.t[use[s.name]], s.values[use[s.name]]) for s in series}
+        pieces |= {c.name: (c.t, c.values) for c in controls}
         own = state
         for s in series:
             if k and isinstance(channels[s.name].observer, Part):
@@ -115,12 +118,11 @@ def jumps(fit: Fit) -> dict[str, np.ndarray]:
         By "ball.x" [m], "ball.v" [m/s], "ball.w" [rad/s], (pieces - 1, D or A) in world axes; and by "ball.angle" or
         "ball.q" [rad], as a rotation vector in axes of the body.
     """
-    spans, so = np.diff([run.start for run in fit.problem.runs]), rotations(fit.world.dim)
-    steps = max(int(np.ceil(spans.max() / np.diff(fit.t).min())), 1)
+    so, records = rotations(fit.world.dim), list(zip(fit.problem.runs, fit.scenes, strict=True))
     turned = "angle" if fit.world.dim == 2 else "q"
     out: dict[str, list[np.ndarray]] = {}
-    for scene, later, span in zip(fit.scenes[:-1], fit.scenes[1:], spans, strict=True):
-        end, next_ = rollout(scene.world, scene.state, dt=span / steps, steps=steps).state, later.state
+    for (run, scene), (next_run, later) in itertools.pairwise(records):
+        end, next_ = motion(scene, run, np.array([next_run.start]), fit.problem.dt).state, later.state
         for k, name in enumerate(fit.world.names):
             apart = {field: getattr(next_, field)[k] - getattr(end, field)[-1, k] for field in ("x", "v", "w")}
             apart[turned] = so.log(so.difference(end.q[-1, k], next_.q[k]))

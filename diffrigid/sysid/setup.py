@@ -22,8 +22,9 @@ from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, Point
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
-from diffrigid.sysid.problem import Group, circular, evaluate, known, linearise, longest_step, make_groups
+from diffrigid.sysid.problem import Group, circular, evaluate, known, linearise, make_groups
 from diffrigid.sysid.records import Run, noise_guess, runs
+from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
 
 LEAST = 1e-9  # noise that is taken for none

@@ -217,7 +217,7 @@ def measured(world: World, data: Mapping[str, Any], t_drawn: np.ndarray, drawn: 
 
     Angles are those of the turn that is nearest to what is drawn, `drawn` (T, K) at t_drawn (T,) [s].
     """
-    found, channels = columns(world, data, {})
+    found, channels, _ = columns(world, data, {})
     t, used = np.unique(np.concatenate([series.t for series in found])), set()
     table = np.full((len(t), len(world.names), 5 if world.dim == 2 else 10), np.nan)
     for series in found:

@@ -1,0 +1,68 @@
+"""Times of a record: those that were measured, those at which a control changes, and the steps between them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffrigid.convert import positive
+from diffrigid.step import Trajectory, rollout
+from diffrigid.sysid.parameters import Scene
+from diffrigid.sysid.records import SAME, Run
+
+
+def longest_step(found: Sequence[Run], dt: float | None) -> float:
+    """[s] as given; default the median of the intervals between times."""
+    if dt is not None:
+        return float(positive("dt", dt, "it is the longest step in s"))
+    return float(np.median(np.concatenate([np.diff(all_times(run)) for run in found])))
+
+
+def controls_over(run: Run, t: np.ndarray) -> dict[str, np.ndarray] | None:
+    """Controls of a record over steps that begin at times t (S,) [s], (S, size): each value is held until the next."""
+    rows = {c.name: np.searchsorted(c.t, t + SAME, side="right") - 1 for c in run.controls}
+    return {c.name: c.values[np.maximum(rows[c.name], 0)] for c in run.controls} or None
+
+
+def all_times(run: Run) -> np.ndarray:
+    """Start and every measured time, once each."""
+    return _once([run.start], *(series.t for series in run.series))
+
+
+def _once(*times: Any) -> np.ndarray:
+    t = np.unique(np.concatenate(times))
+    return t[np.concatenate([[True], np.diff(t) > SAME])]
+
+
+def with_changes(run: Run, t: np.ndarray) -> np.ndarray:
+    """Times, and those between them at which a control changes."""
+    return _once(t, *(c.t[(c.t > t[0]) & (c.t < t[-1])] for c in run.controls))
+
+
+def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
+    """Of a record from its start, at increasing times t (K,) [s] after it; no step is longer than `longest` [s]."""
+    since = with_changes(run, _once([run.start], t))
+    controls = controls_over(run, since[:-1])
+    states = rollout(scene.world, scene.state, dt=longest, times=since - run.start, controls=controls).state
+    wanted, gaps = np.searchsorted(since, t - SAME), np.diff(since)[:, None]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(gaps * values, wanted[:-1]) / np.diff(t)[:, None]
+
+    return Trajectory(
+        t=t,  # type: ignore[arg-type]
+        state=jax.tree.map(lambda leaf: leaf[wanted], states),
+        world=scene.world,
+        controls=jax.tree.map(mean, controls),
+    )
+
+
+def grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Lengths of the steps that land on every measured time, and for each column the state of each of its rows."""
+    t = with_changes(run, all_times(run))
+    gaps = np.diff(t)
+    counts = np.maximum(np.ceil(gaps / longest - 1e-6), 1).astype(int)
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    index = {s.name: ends[np.clip(np.searchsorted(t, s.t - SAME), 0, len(t) - 1)] for s in run.series}
+    return np.repeat(gaps / counts, counts), index
