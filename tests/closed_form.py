@@ -42,6 +42,20 @@ def vector(*components):
     return jnp.stack([jnp.asarray(c, float) for c in components])
 
 
+def with_slopes(fn, derivative=jax.jacfwd):
+    """A function that returns `fn` and its slopes by all arguments, from one program."""
+
+    def twice(*args):
+        value = fn(*args)
+        return value, value
+
+    def both(*args):
+        slopes, value = derivative(twice, tuple(range(len(args))), has_aux=True)(*args)
+        return value, slopes
+
+    return both
+
+
 def floats(parameters):
     return {name: jnp.asarray(value, float) for name, value in parameters.items()}
 

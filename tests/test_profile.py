@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_form import vector
+from closed_form import vector, with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -98,7 +98,7 @@ def test_a_disc_bounces_off_a_segment():
     arguments, disc = (points, vector(-0.7, 1.0), jnp.asarray(0.6), jnp.asarray(0.7)), dr.Disc(radius=0.1)
 
     def both(fn):
-        return jax.jit(lambda *args: (fn(*args), jax.jacrev(fn, (0, 1, 2, 3))(*args)))(*arguments)
+        return jax.jit(with_slopes(fn, jax.jacrev))(*arguments)
 
     got = both(lambda points, x, e, t: end(disc, points, x, vector(0.0, 0.0), e, 0.0, t))
     expected = both(lambda points, x, e, t: bounced(points, x, e, t, 0.1))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_form import vector
+from closed_form import vector, with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -37,7 +37,7 @@ def test_bounces_of_several_drops(dim, derivative):
     """e^2 h with e at the speed of each, for a batch of drops, and slopes by height, restitution and fall-off."""
 
     def both(height):
-        return jax.vmap(lambda h, e, c: (height(h, e, c), derivative(height, (0, 1, 2))(h, e, c)))
+        return jax.vmap(with_slopes(height, derivative))
 
     h = jnp.array([0.02, 0.3, 1.0, 2.0])
     e, c = jnp.full_like(h, 0.9), jnp.array([0.0, 0.5, 0.5, 3.0])  # 0 is constant

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_form import vector
+from closed_form import vector, with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -35,11 +35,9 @@ def at(t, scene, steps=60):
 
 def check_with_slopes(got, expected, cases, derivative):
     """Two functions of the same numbers, and their slopes, for a batch of cases."""
-    cases = jnp.array(cases)
-    which = tuple(range(cases.shape[1]))
 
     def both(fn):
-        return jax.jit(jax.vmap(lambda row: (fn(*row), derivative(fn, which)(*row))))(cases)
+        return jax.jit(jax.vmap(lambda row: with_slopes(fn, derivative)(*row)))(jnp.array(cases))
 
     jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), both(got), both(expected))
 
@@ -79,10 +77,10 @@ CASES = {
 @pytest.mark.parametrize("dim, derivative", [(2, jax.jacrev), (3, jax.jacfwd)])
 def test_a_ball_on_a_plane(dim, derivative):
     """A batch of cases, and slopes by both frictions, speed, slope and time."""
-    which = tuple(range(5))
 
     def both(row):
-        return rolling(dim, *row), jnp.stack(derivative(lambda *row: rolling(dim, *row), which)(*row))
+        value, slopes = with_slopes(lambda *row: rolling(dim, *row), derivative)(*row)
+        return value, jnp.stack(slopes)
 
     values, slopes = jax.jit(jax.vmap(both))(jnp.array([row for _, row in CASES.values()]))
     for (name, (law, row)), value, slope in zip(CASES.items(), values, slopes, strict=True):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_form import with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -35,7 +36,7 @@ def turned(scene, seconds):
 def check_with_slopes(got, expected, arguments, derivative=jax.jacfwd, atol=EXACT):
     """Two functions of the same numbers, and their slopes, compiled at once."""
     numbers, which = tuple(map(jnp.asarray, arguments)), tuple(range(len(arguments)))
-    value, slopes = jax.jit(lambda *numbers: (got(*numbers), derivative(got, which)(*numbers)))(*numbers)
+    value, slopes = jax.jit(with_slopes(got, derivative))(*numbers)
     assert_allclose(value, expected(*numbers), atol=atol)
     assert_allclose(slopes, jax.jacfwd(expected, which)(*numbers), atol=atol)
 
