@@ -49,7 +49,7 @@ from diffrigid.sysid import (
     shares,
     student,
 )
-from diffrigid.view import Player, play
+from diffrigid.view import Player, explore, play
 from diffrigid.world import World, check
 
 __all__ = [
@@ -92,6 +92,7 @@ __all__ = [
     "check",
     "direction",
     "each",
+    "explore",
     "fit",
     "huber",
     "inertia",

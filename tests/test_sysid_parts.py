@@ -142,7 +142,7 @@ def test_tables_files_and_dictionaries_say_the_same(tmp_path):
     rows = [f"{t},{t**2},{'' if k == 2 else 0.0}" for k, t in enumerate(T)]
     file.write_text("\n".join(["t,cue.x[1],cue.angle", *rows]) + "\n")
     for data in (Table(), file, read_csv(str(file))):
-        series, _ = columns(WORLD, data, {})
+        series, *_ = columns(WORLD, data, {})
         x, angle = series
         assert (x.name, angle.name) == ("cue.x", "cue.angle")
         assert np.isnan(x.values[:, 0]).all()
@@ -160,7 +160,7 @@ def test_a_file_as_spreadsheets_write_it(tmp_path):
 
 def test_columns_may_have_times_of_their_own():
     slow = T[::2] + 0.03
-    series, _ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
+    series, *_ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
     assert_allclose([s.t[-1] for s in series], [T[-1], slow[-1]])
 
 

@@ -83,12 +83,15 @@ def times(t: np.ndarray) -> Any:
     return base64.b64encode(t.astype("<f8").tobytes()).decode()
 
 
-def record(trajectory: Trajectory, name: str, data: Mapping[str, Any] | None, frames: int) -> dict[str, Any]:
-    """All that is drawn of one trajectory, at no more than `frames` of its times."""
+def record(
+    trajectory: Trajectory, name: str, data: Mapping[str, Any] | None, frames: int, touching: bool = True
+) -> dict[str, Any]:
+    """All that is drawn of one trajectory, at no more than `frames` of its times; its contacts if `touching`."""
     world, t = trajectory.world, np.asarray(trajectory.t, float)
     kept = np.unique(np.rint(np.linspace(0, len(t) - 1, min(len(t), frames))).astype(int))
     some = jax.tree.map(lambda leaf: np.asarray(leaf, float)[kept], trajectory.state)
-    table, marks = poses(trajectory)[kept], contacts(trajectory, t[kept])
+    table = poses(trajectory)[kept]
+    marks = contacts(trajectory, t[kept]) if touching else np.zeros((0, 2 + 2 * world.dim))
     return {
         "name": name,
         "bodies": list(world.names),

@@ -218,6 +218,15 @@ function makePlayer(data) {
   graph.choice(bar);
   element(bar, "button", { type: "button", title: "whole view", "aria-label": "whole view" }, "⤢").addEventListener("click", () => { view.fit(); draw(); });
   scene.refresh = () => { key?.remove(); key = makeKey(stage, scene); view.redye?.(); graph.redo(); draw(); };
+  scene.renew = (sources) => { // other motions of the same bodies, over the same times: see explore.js
+    scene.runs.forEach((run, r) => Object.assign(run, makeRun(sources[r], scene.dim)));
+    view.renew?.();
+    scene.refresh();
+  };
+  window.addEventListener("message", ({ data }) => {
+    if (data?.runs) scene.renew(data.runs);
+    if (data?.end) scene.seek(scene.last);
+  });
   scene.seek = (time) => { play(false); show(time); };
   button.addEventListener("click", () => play(!playing));
   scrub.addEventListener("input", () => scene.seek(Number(scrub.value)));

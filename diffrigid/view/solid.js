@@ -124,7 +124,7 @@ function makeView(canvas, scene, redraw) {
     stage.add(sun, sun.target, new THREE.HemisphereLight(0xffffff, 0x8f969e, 1.7));
     stage.background = new THREE.Color();
     stage.fog = new THREE.Fog(0, 1, 2); // so that the ground has no edge
-    return { stage, runs };
+    return { whole: stage, stage: new THREE.Group(), runs };
   }
   function fill({ stage, runs }) {
     const parts = runs.map((run, r) => {
@@ -202,13 +202,13 @@ function makeView(canvas, scene, redraw) {
     camera.updateProjectionMatrix();
     stages.forEach((cell, n) => {
       cell.parts.forEach(update);
-      cell.stage.background.set(scene.colour("page"));
-      cell.stage.fog.color.set(scene.colour("page"));
-      Object.assign(cell.stage.fog, { near: away + 0.8 * size, far: away + 3.5 * size });
+      cell.whole.background.set(scene.colour("page"));
+      cell.whole.fog.color.set(scene.colour("page"));
+      Object.assign(cell.whole.fog, { near: away + 0.8 * size, far: away + 3.5 * size });
       const left = (n % grid.columns) * grid.w, top = Math.floor(n / grid.columns) * grid.h;
       renderer.setViewport(left, height - top - grid.h, grid.w, grid.h);
       renderer.setScissor(left, height - top - grid.h, grid.w, grid.h);
-      renderer.render(cell.stage, camera);
+      renderer.render(cell.whole, camera);
     });
     view.screen = (x) => { const p = vector(x).project(camera); return [((p.x + 1) / 2) * grid.w, ((1 - p.y) / 2) * grid.h]; };
     if (scene.beside) names(grid);
@@ -229,7 +229,17 @@ function makeView(canvas, scene, redraw) {
     zoom: (factor) => { camera.position.sub(controls.target).divideScalar(factor).add(controls.target); controls.update(); redraw(); },
   };
   fit();
-  for (const cell of stages) cell.parts = fill(cell);
+  view.renew = () => {
+    view.paints = [];
+    for (const cell of stages) {
+      cell.whole.remove(cell.stage);
+      cell.stage.traverse(({ geometry, material }) => { geometry?.dispose(); material?.dispose(); });
+      cell.stage = new THREE.Group();
+      cell.whole.add(cell.stage);
+      cell.parts = fill(cell);
+    }
+  };
+  view.renew();
   controls.addEventListener("change", () => redraw());
   canvas.addEventListener("wheel", (event) => { controls.enableZoom = document.hasFocus() || event.ctrlKey; }, { capture: true, passive: true });
   canvas.addEventListener("dblclick", () => { fit(); redraw(); });

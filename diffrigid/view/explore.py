@@ -1,0 +1,183 @@
+"""`explore`: sliders for parameters of a scene, and its motion and the slope of that beside them, at once.
+
+What a slider moves is an argument of one compiled program, so a new motion takes milliseconds. The player shows two:
+the motion itself, and where its derivative by the parameter moved last says that it goes, a straight line ahead.
+"""
+
+import re
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from diffrigid import paths
+from diffrigid.compiling import QUICK, uncollected
+from diffrigid.state import State
+from diffrigid.step import Trajectory, at_least_one, floats, rollout, step_length
+from diffrigid.view.frames import record
+from diffrigid.view.play import play
+from diffrigid.world import World, check
+
+AHEAD = 0.05  # of the range of a parameter: how far its slope is followed
+FRAMES = 240  # times that are sent to the browser, at most
+
+
+class Explorer:
+    """What `explore` returns: a notebook shows it, `values` are the numbers by name, `scene` what they make.
+
+    Example:
+        >>> explorer = dr.view.Explorer(world, state, {"restitution": (0.0, 1.0)}, dt=1 / 60, steps=30)
+        >>> explorer.move("restitution", 0.5)  # as the slider does
+        >>> round(float(explorer.trajectory.state.x[-1, 0, 1]), 4), explorer.values
+        (0.2112, {'restitution': 0.5})
+    """
+
+    def __init__(
+        self, world: World, state: State, ranges: Mapping[str, tuple[float, float]], *, dt: float, steps: int
+    ) -> None:
+        check(world, state)
+        self._start = floats(world, state)
+        step_length(dt, state)
+        run = partial(_with_slope, tuple(ranges), dt=dt, steps=at_least_one("steps", steps))
+        self._run = uncollected(jax.jit(run, compiler_options=QUICK))
+        self.ranges = {name: _range(name, span) for name, span in ranges.items()}
+        if not self.ranges:
+            raise ValueError("ranges is empty: expected names of parameters with their ranges, {'restitution': (0, 1)}")
+        self.values = {name: float(_number(*self._start, name)) for name in self.ranges}
+        for name, (low, high) in self.ranges.items():
+            if not low <= self.values[name] <= high:
+                raise ValueError(f"{name} is {self.values[name]:g}, outside its range ({low:g}, {high:g})")
+        self.move(next(iter(self.ranges)), None)
+
+    def move(self, name: str, value: float | None) -> None:
+        """Give a parameter a value, None for the one it has, and follow its slope from now on."""
+        if name not in self.ranges:
+            raise ValueError(f"no slider {name!r}, there are {list(self.ranges)}")
+        self.leading, (low, high) = name, self.ranges[name]
+        self.values[name] = self.values[name] if value is None else float(np.clip(value, low, high))
+        ahead = np.array([AHEAD * (high - low) * (other == name) for other in self.ranges])
+        self.trajectory, self.slope = self._run(*self._start, np.array(list(self.values.values())), ahead)
+
+    @property
+    def scene(self) -> tuple[World, State]:
+        """World and initial state with the values put in."""
+        return self.trajectory.world, jax.tree.map(lambda leaf: leaf[0], self.trajectory.state)
+
+    @property
+    def widget(self) -> Any:
+        """The sliders and the player; needs anywidget."""
+        from diffrigid.view.widget import widget_of
+
+        return widget_of(self)
+
+    def unit(self, name: str) -> str:
+        """SI unit of a parameter."""
+        return paths.unit(self.trajectory.world, _split(name)[0])
+
+    def sliders(self) -> list[dict[str, Any]]:
+        """What the sliders show."""
+        return [
+            {"name": name, "low": low, "high": high, "value": self.values[name], "unit": self.unit(name)}
+            for name, (low, high) in self.ranges.items()
+        ]
+
+    def runs(self) -> dict[str, Trajectory]:
+        """The motion and, by a name that says how far, where its slope leads."""
+        low, high = self.ranges[self.leading]
+        step = f"{AHEAD * (high - low):.3g} {self.unit(self.leading)}".strip()
+        return {"motion": self.trajectory, f"its slope by {self.leading}, + {step}": self.slope}
+
+    def sources(self) -> list[dict[str, Any]]:
+        """What the player draws of both."""
+        motion, slope = self.runs().items()
+        return [
+            record(motion[1], motion[0], None, FRAMES),
+            record(slope[1], slope[0], None, FRAMES, touching=False),
+        ]
+
+    def page(self) -> str:
+        """The page of the player."""
+        return play(self.runs(), frames=FRAMES, show=("trails", "contacts"), plot="").page
+
+    def _repr_mimebundle_(self, **options: Any) -> Any:
+        return self.widget._repr_mimebundle_(**options)
+
+
+def explore(
+    world: World, state: State, ranges: Mapping[str, tuple[float, float]], *, dt: float, steps: int
+) -> Explorer:
+    """Sliders for parameters of a scene, beside the motion, which follows as they are dragged, and its slope.
+
+    The slope is drawn as a second motion: where the derivative by the parameter that was moved last says that bodies
+    would be if it grew by a twentieth of its range. Where both part, at an impact that appears or vanishes, the
+    motion is no straight line.
+
+    Args:
+        ranges: lowest and highest value of each parameter by its path, "restitution", "ball.mass" or "ball.v[0]".
+        dt: [s] length of a step. steps: number of steps.
+
+    Returns:
+        An `Explorer`, which a notebook shows (pip install "diffrigid[notebook]").
+
+    Raises:
+        ValueError: no such parameter, one that is no number, or one that starts outside its range.
+
+    Example:
+        >>> dr.explore(world, state, {"restitution": (0, 1), "ball.v[1]": (-2, 2)}, dt=1 / 60, steps=30).values
+        {'restitution': 0.8, 'ball.v[1]': 0.0}
+    """
+    return Explorer(world, state, ranges, dt=dt, steps=steps)
+
+
+def _range(name: str, span: Any) -> tuple[float, float]:
+    try:
+        low, high = map(float, span)
+    except (TypeError, ValueError):
+        raise ValueError(f"ranges[{name!r}] is {span!r}: expected two numbers, (low, high)") from None
+    if not (np.isfinite([low, high]).all() and low < high):
+        raise ValueError(f"ranges[{name!r}] is ({low:g}, {high:g}): expected low < high, finite")
+    return low, high
+
+
+def _split(name: str) -> tuple[str, int | None]:
+    """Path and component: "ball.v[0]" is ("ball.v", 0)."""
+    match = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    return (match[1], int(match[2])) if match else (name, None)
+
+
+def _number(world: World, state: State, name: str) -> Array:
+    path, component = _split(name)
+    value = jnp.asarray(paths.read(world, state, path))
+    if component is None and value.ndim == 0:
+        return value
+    if value.ndim != 1 or component is None or component >= len(value):
+        raise ValueError(f"{name} is no number, {path} has the shape {value.shape}: choose one, as in '{path}[0]'")
+    return value[component]
+
+
+def _put(world: World, state: State, name: str, number: Array) -> tuple[World, State]:
+    path, component = _split(name)
+    value = number if component is None else paths.read(world, state, path).at[component].set(number)
+    return paths.write(world, state, path, value)
+
+
+def _with_slope(
+    names: tuple[str, ...], world: World, state: State, values: Array, ahead: Array, *, dt: float, steps: int
+) -> tuple[Trajectory, Trajectory]:
+    """The motion, and the same moved by its derivative along `ahead`."""
+
+    def path(values: Array) -> Trajectory:
+        changed = world, state
+        for name, number in zip(names, values, strict=True):
+            changed = _put(*changed, name, number)
+        return rollout(*changed, dt=dt, steps=steps)
+
+    dtype = state.x.dtype
+    motion, slope = jax.jvp(path, (values.astype(dtype),), (ahead.astype(dtype),))
+    moved: State = jax.tree.map(jnp.add, motion.state, slope.state)
+    q = moved.q / jnp.sqrt((moved.q**2).sum(-1, keepdims=True))
+    return motion, Trajectory(t=motion.t, state=State(x=moved.x, q=q, v=moved.v, w=moved.w), world=motion.world)
