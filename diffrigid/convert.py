@@ -6,6 +6,7 @@ Every function takes the name of the argument first, for its messages. Known val
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -184,7 +185,10 @@ def shape_of(name: str, shape: Any, dim: int) -> Any:
 
 def solid_of(shape: Any, dim: int) -> Solid | None:
     """A shape with its properties; None for None."""
-    return None if shape is None else Solid(shape, *known(lambda s: volume_properties(s, dim), shape))
+    return None if shape is None else Solid(shape, *known(partial(_volume_properties, dim=dim), shape))
+
+
+_volume_properties = jax.jit(volume_properties, static_argnames="dim")  # one program in place of some dozen
 
 
 def mass_and_inertia(name: str, body: Any, solid: Solid | None, dim: int) -> tuple[Numbers, Numbers]:

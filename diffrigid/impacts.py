@@ -15,12 +15,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax import Array
 
 from diffrigid.forces import total_wrench
 from diffrigid.hull import hull_faces
 from diffrigid.pytree import replace
 from diffrigid.shapes import UNEVEN, HalfSpace, edges, radius, vertices
-from diffrigid.state import momentum, spin
+from diffrigid.state import Bodies, State, Wrench, momentum, spin
 from diffrigid.step import Trajectory
 from diffrigid.touch import Side, gaps, rotated
 from diffrigid.world import World
@@ -127,20 +128,27 @@ def _changes(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray
     and the size of what the forces did, (T, N), all [N s]."""
     bodies, h = trajectory.world.bodies, np.diff(trajectory.t)[:, None, None]
     state = jax.tree.map(lambda leaf: leaf.astype(bodies.mass.dtype), trajectory.state)
-    p, L = (np.asarray(jax.vmap(of, (None, 0))(bodies, state), float) for of in (momentum, spin))
+    *both, wrench = _momenta(trajectory.world.forces, bodies, state, trajectory.controls)
+    p, L = (np.asarray(momenta, float) for momenta in both)
+
+    def added(force, like):
+        return np.zeros_like(like[1:]) if force is None else h * np.asarray(force, float)
+
+    F = added(wrench.F, p)
+    return np.diff(p, axis=0) - F, np.diff(L, axis=0) - added(wrench.tau, L), np.linalg.norm(F, axis=2)
+
+
+@jax.jit
+def _momenta(forces: tuple, bodies: Bodies, states: State, controls: Any) -> tuple[Array, Array, Wrench]:
+    """Of states (T+1, ...): momenta and angular momenta, and the means of the forces at both ends of each interval."""
 
     def wrench(state, controls):
-        return total_wrench(trajectory.world.forces, bodies, state, controls)
+        return total_wrench(forces, bodies, state, controls)
 
-    ends = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], state) for rows in (slice(None, -1), slice(1, None))]
-    at_ends = [jax.vmap(wrench)(end, trajectory.controls) for end in ends]
-
-    def added(name, like):
-        forces = [getattr(found, name) for found in at_ends]
-        return np.zeros_like(like[1:]) if forces[0] is None else h * np.asarray(forces[0] + forces[1], float) / 2
-
-    F = added("F", p)
-    return np.diff(p, axis=0) - F, np.diff(L, axis=0) - added("tau", L), np.linalg.norm(F, axis=2)
+    p, L = (jax.vmap(of, (None, 0))(bodies, states) for of in (momentum, spin))
+    ends = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], states) for rows in (slice(None, -1), slice(1, None))]
+    at_ends = [jax.vmap(wrench)(end, controls) for end in ends]
+    return p, L, jax.tree.map(lambda a, b: 0.5 * (a + b), *at_ends)
 
 
 def _touches(world: World, group: Any, motion: Motion, dp: np.ndarray, dL: np.ndarray, push: np.ndarray) -> Touch:

@@ -281,7 +281,7 @@ def volume_properties(shape: Shape, dim: int) -> tuple[Array, Array, Array]:
         raise ValueError(f"this {name} is {dimension(shape)}D but dim is {dim}: use a shape of {dim}D.")
     volume, center, second = _moments(shape, dim)
     spread = jnp.trace(second)
-    return volume, center, spread if dim == 2 else spread * jnp.eye(3, dtype=second.dtype) - second
+    return volume, center, spread if dim == 2 else spread * np.eye(3, dtype=second.dtype) - second
 
 
 def _moments(shape, dim):
@@ -305,7 +305,7 @@ def _moments(shape, dim):
 
 def _centred(volume, spread):
     """Moments of a shape with its centre at the origin and mean squares `spread`, (D,) [m^2], of x, y, z."""
-    return volume, jnp.zeros_like(spread), jnp.diag(spread)
+    return volume, jnp.zeros_like(spread), spread[:, None] * np.eye(len(spread), dtype=spread.dtype)
 
 
 def _capsule_moments(r, h, dim):

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from diffrigid.convert import numbers
@@ -173,10 +172,9 @@ def finish(
     residuals = tuple(by_column(problem, point, best))
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, scenes)
     order = np.argsort(costs)
-    sorted_z = jax.tree.map(lambda leaf: leaf[..., order], point.z)
     summary = Summary(
         parameters=parameters, noise=_all_noise(problem), costs=costs[order],
-        orders=impact_orders(problem, sorted_z, int(np.isfinite(costs).sum())),
+        orders=impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum())),
         agree=int((costs <= costs[best] + ALIKE + 1e-3 * costs[best]).sum()), notes=(*remarks, *notes), seed=seed,
         seconds=time.time() - began, versions=versions(),
     )  # fmt: skip

@@ -32,9 +32,23 @@ class Numbers(NamedTuple):
 
     def of(self, members: Sequence[int]) -> Array:
         """All numbers of some records, (a + b, R of them, S)."""
-        own = self.own[:, jnp.asarray(members)]
-        shared = jnp.broadcast_to(self.shared[:, None], (self.shared.shape[0], *own.shape[1:]))
-        return jnp.concatenate([shared, own])
+        return _of(self, tuple(members))
+
+    def sorted(self, order: Any) -> "Numbers":
+        """With the starts in another order."""
+        return _sorted(self, order)
+
+
+@partial(jax.jit, static_argnames="members")
+def _of(z: Numbers, members: tuple[int, ...]) -> Array:
+    own = z.own[:, np.array(members)]
+    shared = jnp.broadcast_to(z.shared[:, None], (z.shared.shape[0], *own.shape[1:]))
+    return jnp.concatenate([shared, own])
+
+
+@jax.jit
+def _sorted(z: Numbers, order: Array) -> Numbers:
+    return Numbers(*(leaf[..., order] for leaf in z))
 
 
 class Point(NamedTuple):
@@ -205,18 +219,24 @@ def minimise(
 ) -> tuple[Point, bool]:  # fmt: skip
     """As `levenberg`, of any residuals: `at` gives them and their Jacobians, for groups of the records `members`."""
     trial = at(z)
-    starts = jnp.zeros_like(z.own, shape=z.own.shape[1:])
-    progress = Progress(trial, starts + jnp.inf, starts + 5e-2, starts > 0)
+    progress = Progress(trial, *_nothing_yet(z.own))
     try:
         for count in range(iterations + 1):
             progress, z = update(loss, members, progress, trial, reach)
-            report(count, np.asarray(progress.cost.sum(0)))
-            if count == iterations or bool(progress.done.all()):
+            report(count, np.asarray(progress.cost).sum(0))
+            if count == iterations or np.asarray(progress.done).all():
                 break
             trial = at(z)
     except KeyboardInterrupt:
         return progress.point, True
     return progress.point, False
+
+
+@jax.jit
+def _nothing_yet(own: Array) -> tuple[Array, Array, Array]:
+    """Cost, damping and `done` of `Progress` before the first step."""
+    starts = jnp.zeros(own.shape[1:], own.dtype)
+    return starts + jnp.inf, starts + 5e-2, starts > 0
 
 
 def least_squares(residuals: Callable[[Array], Array], z: Array, iterations: int = 60) -> tuple[Array, Array]:

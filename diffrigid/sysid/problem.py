@@ -111,7 +111,9 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
         weights=stacked(lambda k, name: known(found[k], name).astype(float)),
         width=np.zeros(()),
     )
-    data = jax.tree.map(lambda a: jnp.asarray(a, dtype if np.issubdtype(a.dtype, np.floating) else np.int32), data)
+    data = jax.tree.map(
+        lambda a: jnp.asarray(a.astype(dtype if np.issubdtype(a.dtype, np.floating) else np.int32)), data
+    )
     return Group(Plan(here, clocked, priors), data, members)
 
 

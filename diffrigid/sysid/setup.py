@@ -171,7 +171,7 @@ def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
         own.append(np.concatenate(rows) if rows else first_own)
     dtype = problem.runs[0].state.x.dtype
     # Everywhere from the beginning: what a solver returns is, and else all would be compiled again for that.
-    return everywhere(Numbers(jnp.asarray(np.stack(shared, -1), dtype), jnp.asarray(np.stack(own, -1), dtype)))
+    return everywhere(Numbers(*(jnp.asarray(np.stack(rows, -1).astype(dtype)) for rows in (shared, own))))
 
 
 def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
@@ -182,7 +182,8 @@ def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
         real = [isinstance(slot.kind, Free) and np.isinf(slot.kind.low) for slot in slots]
         parts.append(_joined([np.full(slot.size, np.inf if r else 2.0) for slot, r in zip(slots, real, strict=True)]))
     parts[0][list(held)] = 0.0
-    return Numbers(jnp.asarray(parts[0], dtype)[:, None], jnp.asarray(parts[1], dtype)[:, None, None])
+    a, b = (part.astype(dtype) for part in parts)
+    return Numbers(jnp.asarray(a[:, None]), jnp.asarray(b[:, None, None]))
 
 
 def _value(problem: Problem, slot: Slot) -> Any:
