@@ -46,13 +46,15 @@ IMPACT, HOLD, PUSH = 0, 1, 2
 class Contact:
     """The one contact model. Restitution and friction belong to the bodies; what is numerical is here.
 
-    width: (*batch) [m] 0 is exact. Positive: smooth collision impulses, for paths that just miss as well. A
-        traced number: anneal it to zero without recompiling.
-    rest_speed: (*batch) [m/s] slower impacts do not rebound. Whatever its speed, an impact after which the
-        bodies would meet again before the step ends does not rebound either, but rests.
-    sweeps: how many impacts in a row a body may have within one step. One that comes later is found late and
-        repaired in the next step. Sweeps that are not needed cost nothing.
-    neighbours: for how many others near a body there is room, in a crowd of 256 bodies and more; see `missed_pairs`.
+    Args:
+        width: (*batch) [m] 0 is exact. Positive: smooth collision impulses, for paths that just miss as well. A
+            traced number: anneal it to zero without recompiling.
+        rest_speed: (*batch) [m/s] slower impacts do not rebound. Whatever its speed, an impact after which the
+            bodies would meet again before the step ends does not rebound either, but rests.
+        sweeps: how many impacts in a row a body may have within one step. One that comes later is found late and
+            repaired in the next step. Sweeps that are not needed cost nothing.
+        neighbours: for how many others near a body there is room, in a crowd of 256 bodies and more: see
+            `missed_pairs`.
 
     Differentiable at width > 0 wherever the paths are; at width = 0 with kinks where an impact appears or
     vanishes (grazing), where two coincide, and where sticking turns to slipping.
