@@ -3,14 +3,14 @@
     python experiments/elbow_toss.py [--data FILE] [--train 100] [--test 104]
 
 Measured tosses of two boxes on a hinge that rubs (DAIRLab, see the README beside the data; the files are not part of
-this project). In two stages, on the first tosses: the flights before the first impact, by Levenberg-Marquardt with the
-start of each toss beside the mass ratio, the inertia (as a multiple of that of uniform boxes) and the damping of the
-hinge; then, open loop over the whole tosses, mass ratio, inertia, friction, restitution and dry friction of the hinge
-by draws ever closer to the best. Intervals: the tosses of the fit drawn again with replacement, 1000 times (of the
-flights linearised, of the whole tosses among the draws). Scored open loop on other tosses: one simulation a toss from
-its start, mean over frames of the distance of link 1 in per cent of its length, its angle of rotation, and that of link
-2 against where the measured hinge angle has it. Beside it, what the source of the data puts in: equal masses, 6.167e-4
-kg m^2 about all axes, friction 0.3.
+this project). In two stages, on the first tosses: the flights before the first impact, by Levenberg-Marquardt with
+the start of each toss beside the mass ratio, the inertia (as a multiple of that of uniform boxes) and the damping of
+the hinge; then, open loop over the whole tosses, mass ratio, inertia, friction, restitution and dry friction of the
+hinge by differential evolution. Intervals: the tosses of the fit drawn again with replacement, 1000 times (of the
+flights linearised, of the whole tosses among the points of the search). Scored open loop on other tosses: one
+simulation a toss from its start, mean over frames of the distance of link 1 in per cent of its length, its angle of
+rotation, and that of link 2 against where the measured hinge angle has it. Beside it, what the source of the data
+puts in: equal masses, 6.167e-4 kg m^2 about all axes, friction 0.3.
 
 Result (November 2026). Flights of 100 tosses: ratio 1.2 (0.61 to 2.4), inertia 1.4 (0.65 to 3.1), damping 0.0030
 (0.0014 to 0.0058) N m s/rad: the flights tell that the hinge rubs, little of the masses. Open loop on the other 104,
@@ -34,7 +34,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scoring import angle_between, arguments, show
+from scoring import angle_between, arguments, search, show
 
 import diffrigid as dr
 from diffrigid import so3
@@ -65,7 +65,6 @@ RANGES = {
     "restitution": (0.0, 0.4),
     "hinge": (0.0, 0.04),
 }
-POINTS, NARROW = 32, (1.0, 0.4, 0.15)  # draws of a round, and their spread in each, as a share of the ranges
 UNITS = np.array([20.0, 40.0, 40.0])  # [%], [degrees], [degrees]: what the errors are weighed by
 
 
@@ -266,21 +265,6 @@ def errors(record: dict, tensor: np.ndarray, starts: np.ndarray, damping: float)
     return of
 
 
-def search(of, tosses: int):
-    """Values by the names of RANGES with the least mean loss, drawn ever closer to the best, and 95 % of draws."""
-    rng, (low, high) = np.random.default_rng(0), np.array(list(RANGES.values())).T
-    tried, losses, best = np.zeros((0, len(low))), np.zeros((0, tosses)), (low + high) / 2
-    for narrow in NARROW:
-        drawn = best + narrow * (high - low) * (rng.random((POINTS, len(low))) - 0.5)
-        drawn = np.clip(drawn, low, high)
-        tried = np.concatenate([tried, drawn])
-        losses = np.concatenate([losses, (of(dict(zip(RANGES, drawn.T, strict=True))) / UNITS).mean(-1)])
-        best = tried[losses.mean(1).argmin()]
-    again = np.array([losses[:, rng.integers(tosses, size=tosses)].mean(1).argmin() for _ in range(DRAWS)])
-    spans = np.quantile(tried[again], [0.025, 0.975], axis=0)
-    return {name: (best[k], *spans[:, k]) for k, name in enumerate(RANGES)}
-
-
 def main():
     args = arguments(__doc__.splitlines()[0], DATA)
     began, both = time.perf_counter(), slice(0, args.train + args.test)
@@ -290,7 +274,8 @@ def main():
     low, high = np.quantile(draws, [0.025, 0.975], axis=0)
     show({name: (flight[name], *(np.exp(end[k]) * GUESS[name] for end in (low, high))) for k, name in enumerate(GUESS)})
     part = {name: value[train] if np.ndim(value) else value for name, value in record.items()}
-    found = search(errors(part, UNIFORM, starts[train], flight["damping"]), args.train)
+    of = errors(part, UNIFORM, starts[train], flight["damping"])
+    found = search(lambda values: (of(values) / UNITS).mean(-1), RANGES)
     print(f"the whole tosses: {time.perf_counter() - began:.0f} s")
     show(found)
     fitted = {name: np.array([value]) for name, (value, *_) in found.items()}

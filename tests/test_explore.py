@@ -53,7 +53,8 @@ def test_motion_and_slope_are_those_of_the_values(explorer):
 def test_mistakes_are_named():
     world, state = made().scene
     for ranges, message in (
-        ({}, "ranges is empty"),
+        ({}, "ranges is {}: expected a dict of parameters"),
+        (["restitution"], "expected a dict of parameters"),
         ({"restitution": (1.0, 0.0)}, r"ranges\['restitution'\] is \(1, 0\): expected low < high"),
         ({"restitution": 1.0}, r"expected two numbers, \(low, high\)"),
         ({"restitution": (0.0, 0.5)}, r"restitution is 0.8, outside its range \(0, 0.5\)"),

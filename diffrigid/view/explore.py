@@ -27,14 +27,7 @@ FRAMES = 240  # times that are sent to the browser, at most
 
 
 class Explorer:
-    """What `explore` returns: a notebook shows it, `values` are the numbers by name, `scene` what they make.
-
-    Example:
-        >>> explorer = dr.view.Explorer(world, state, {"restitution": (0.0, 1.0)}, dt=1 / 60, steps=30)
-        >>> explorer.move("restitution", 0.5)  # as the slider does
-        >>> round(float(explorer.trajectory.state.x[-1, 0, 1]), 4), explorer.values
-        (0.2112, {'restitution': 0.5})
-    """
+    """What `explore` returns: a notebook shows it, `values` are the numbers by name, `scene` what they make."""
 
     def __init__(
         self, world: World, state: State, ranges: Mapping[str, tuple[float, float]], *, dt: float, steps: int
@@ -42,11 +35,11 @@ class Explorer:
         check(world, state)
         self._start = floats(world, state)
         step_length(dt, state)
+        if not isinstance(ranges, Mapping) or not ranges:
+            raise ValueError(f"ranges is {ranges!r}: expected a dict of parameters, {{'restitution': (0, 1)}}")
+        self.ranges = {name: _range(name, span) for name, span in ranges.items()}
         run = partial(_with_slope, tuple(ranges), dt=dt, steps=at_least_one("steps", steps))
         self._run = uncollected(jax.jit(run, compiler_options=QUICK))
-        self.ranges = {name: _range(name, span) for name, span in ranges.items()}
-        if not self.ranges:
-            raise ValueError("ranges is empty: expected names of parameters with their ranges, {'restitution': (0, 1)}")
         self.values = {name: float(_number(*self._start, name)) for name in self.ranges}
         for name, (low, high) in self.ranges.items():
             if not low <= self.values[name] <= high:
@@ -92,12 +85,8 @@ class Explorer:
         return {"motion": self.trajectory, f"its slope by {self.leading}, + {step}": self.slope}
 
     def sources(self) -> list[dict[str, Any]]:
-        """What the player draws of both."""
-        motion, slope = self.runs().items()
-        return [
-            record(motion[1], motion[0], None, FRAMES),
-            record(slope[1], slope[0], None, FRAMES, touching=False),
-        ]
+        """What the player draws of both; contacts of the motion only."""
+        return [record(run, name, None, FRAMES, run is self.trajectory) for name, run in self.runs().items()]
 
     def page(self) -> str:
         """The page of the player."""
