@@ -1,5 +1,8 @@
 """Where contact is singular or rare: very fast, at rest, grazing, exactly parallel, coincident."""
 
+import functools
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +26,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.contact.impulse import contact_law, impulses
+from diffrigid.contact.slipping import lost_to_stops
 
 EXACT = 1e-9  # relative: rounding of a few hundred steps
 AT_REST = 1e-9  # [m], [m/s]: rounding of a body that is held for a thousand steps
@@ -239,6 +243,16 @@ def test_a_contact_that_is_off_has_no_derivative():
     P, back = jax.vjp(lambda far: impulses(jnp.array([False]), **far), far)
     assert not P.any()
     assert all(not leaf.any() for leaf in jax.tree.leaves(back(jnp.ones_like(P))))
+
+
+def test_friction_of_rounding_has_finite_slopes():
+    """In float32, without friction: quotients of what is left of it, whose squares are below the least number."""
+    pair = SimpleNamespace(a=(0,), b=(1,), active=jnp.array([True]))
+    slip, at_end, friction = (jnp.full((1, 2), size, jnp.float32) for size in (1e-3, 0.9e-3, 1e-16))
+    arguments = jnp.full(1, 4e-3, jnp.float32), slip, at_end, friction, jnp.zeros(1, jnp.float32)
+    lost, back = jax.vjp(functools.partial(lost_to_stops, pair), *arguments)
+    assert not lost.any()
+    assert all(np.isfinite(slope).all() for slope in back(jnp.ones_like(lost)))
 
 
 def test_slopes_after_an_impact_at_the_very_end_of_a_step():

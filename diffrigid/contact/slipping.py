@@ -69,9 +69,11 @@ def lost_to_stops(strikes: Any, T: Array, slip: Array, at_end: Array, friction: 
     speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
-    whole = jnp.where(speed > CREEP, at_end_speed * bound + size * (speed - along), 0.0)
-    share = safe_divide(speed * size, whole)  # tau / T
+    whole = at_end_speed * bound + size * (speed - along)
     stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0) & (speed > CREEP)
+    least = float(jnp.finfo(T.dtype).tiny) ** 0.5  # the derivative of a quotient divides by the square of this
+    stops = stops & (at_end_speed > least) & (whole > least)
+    share = safe_divide(speed * size, jnp.where(stops, whole, 0.0))  # tau / T
     per_speed = safe_divide(own, jnp.where(stops, at_end_speed, 0.0))
     lost = 0.5 * T * (1.0 - jnp.clip(share, 0.0, 1.0)) * per_speed
     return jnp.where(stops[:, None], -lost[:, None] * slip, 0.0)
