@@ -35,14 +35,14 @@ def _once(*times: Any) -> np.ndarray:
     return t[np.concatenate([[True], np.diff(t) > SAME])]
 
 
-def with_changes(run: Run, t: np.ndarray) -> np.ndarray:
+def _with_changes(run: Run, t: np.ndarray) -> np.ndarray:
     """Times, and those between them at which a control changes."""
     return _once(t, *(c.t[(c.t > t[0]) & (c.t < t[-1])] for c in run.controls))
 
 
 def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
     """Of a record from its start, at increasing times t (K,) [s] after it; no step is longer than `longest` [s]."""
-    since = with_changes(run, _once([run.start], t))
+    since = _with_changes(run, _once([run.start], t))
     controls = controls_over(run, since[:-1])
     states = rollout(scene.world, scene.state, dt=longest, times=since - run.start, controls=controls).state
     wanted, gaps = np.searchsorted(since, t - SAME), np.diff(since)[:, None]
@@ -60,7 +60,7 @@ def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
 
 def grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Lengths of the steps that land on every measured time, and for each column the state of each of its rows."""
-    t = with_changes(run, all_times(run))
+    t = _with_changes(run, all_times(run))
     gaps = np.diff(t)
     counts = np.maximum(np.ceil(gaps / longest - 1e-6), 1).astype(int)
     ends = np.concatenate([[0], np.cumsum(counts)])
