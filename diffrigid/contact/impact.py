@@ -77,7 +77,7 @@ def find_impact(
         s0, level, found, _ = apart(live, approach, a, b, width)
         rests = jnp.zeros_like(found)
     else:
-        s0, level, found, rests = _approach_search(a, b, t1, width, rest_speed)
+        s0, level, found, rests = _approach_search(a, b, t1, width, rest_speed, at_end)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     s0, hit = checkpoint_name((s0, hit), FOUND)
@@ -195,13 +195,16 @@ def meet_on_parabola(gap: Array, v: Array, acc: Array | None, width: Array | Non
 
 
 def _approach_search(
-    a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array
+    a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array, at_end: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Any two shapes: conservative advancement to the neighbourhood, then the parabola of the next contact."""
+    """Any two shapes: conservative advancement to the neighbourhood, then the parabola of the next contact.
+
+    Nothing is looked for `at_end`, a bool.
+    """
     start, bound = _earliest(a, b)
     frozen_a, frozen_b = lax.stop_gradient((a, b))
     size = jnp.minimum(reach_of(a), reach_of(b))
-    near, rests = _advance(frozen_a, frozen_b, start, t1, size, lax.stop_gradient(rest_speed))
+    near, rests = _advance(frozen_a, frozen_b, start, t1, size, lax.stop_gradient(rest_speed), at_end)
     near, rests = checkpoint_name((near, rests), FOUND)
     live = opaque_true(t1)
 
@@ -209,7 +212,7 @@ def _approach_search(
         return _closest_level(a, b, near, t1 - start, width, live)  # type: ignore[arg-type]
 
     level = _if_smooth(width, smooth, jnp.zeros_like, near)
-    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, start, t1, rests, live)
+    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, start, t1, rests, at_end, live)
     return jnp.where(s < bound, start, s), level, found, rests.any(0)
 
 
@@ -256,7 +259,7 @@ def _time_to(height: Array, v: Array, acc: Array) -> Array:
     return jnp.where(sunk, 0.0, jnp.where(v < 0, closing, returning))
 
 
-def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array) -> tuple[Array, Array]:
+def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array, at_end: Array) -> tuple[Array, Array]:
     """Advance until a contact is near and closing, or the step is over; and which contacts (K, *batch) rest.
 
     Those touch, or are about to, no faster than `slow` [m/s], or beside such a one no faster than would rest anyway.
@@ -292,7 +295,7 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array
 
     def busy(carry):
         count, s, dt, _ = carry
-        return (count == 0) | ((count < most) & some((dt > 0) & (s < t1)))
+        return ~at_end & ((count == 0) | ((count < most) & some((dt > 0) & (s < t1))))
 
     def advance(carry):
         count, s, dt, rests = carry
@@ -307,7 +310,8 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array
         return count + 1, onward, safe_time(gap, v, acc, normal, rests, onward), rests
 
     contacts = jax.eval_shape(lambda: _motion(a, b, start, live)[0]).shape
-    return lax.while_loop(busy, advance, (0, start, jnp.zeros_like(start), jnp.zeros(contacts, bool)))[1::2]
+    begin = jnp.where(at_end, t1, start)
+    return lax.while_loop(busy, advance, (0, begin, jnp.zeros_like(start), jnp.zeros(contacts, bool)))[1::2]
 
 
 def _least(times: Array) -> Array:
@@ -335,8 +339,9 @@ def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
 
 
 def _polish(
-    a: Side, b: Side, s: Array, level: Array, size: Array, start: Array, t1: Array, rests: Array, live: Array
-) -> tuple[Array, Array]:
+    a: Side, b: Side, s: Array, level: Array, size: Array, start: Array, t1: Array, rests: Array, at_end: Array,
+    live: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """Time near s at which the first contact comes to gap = level, and whether one does; s if inside and closing.
 
     Not of contacts that rest, (K, *batch) bool.
@@ -345,7 +350,7 @@ def _polish(
 
     def busy(carry):
         count, _, dt, *_ = carry
-        return (count <= POLISH) & some(jnp.abs(dt) > slack * span)
+        return ~at_end & (count <= POLISH) & some(jnp.abs(dt) > slack * span)
 
     def towards(carry):
         count, s, _, _, inside = carry

@@ -108,7 +108,8 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
     before = constant(tuple(tuple(float(i < j) for j in range(moving)) for i in range(moving)), str(dt.dtype))
     rank = sum_of_terms(lax.expand_dims(before, range(2, 1 + lead.ndim)), lead[:, None], 0)[:, 0]
     needed = fold(jnp.add, lead, 0)
-    isolated = ~some(crossed | (needed > ROUNDS * slots_of(moving)) | (world.contact.width > 0))
+    crossed, width = crossed | (needed > ROUNDS * slots_of(moving)), world.contact.width
+    isolated = ~some(crossed if width is None else crossed | (width > 0))
     return Next(lead, rank, other), isolated, needed
 
 

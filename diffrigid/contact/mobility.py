@@ -83,18 +83,24 @@ def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, 
 
 def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
     """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
+    if min(arms.b) >= len(dv):  # with statics only
+        return _at_ends(arms, 0, dv, dw)
+    if min(arms.a) >= len(dv):
+        return -_at_ends(arms, 1, dv, dw)
+    return _at_ends(arms, 0, dv, dw) - _at_ends(arms, 1, dv, dw)
+
+
+def _at_ends(arms: Any, side: int, dv: Array, dw: Array) -> Array:
+    """Changes of the velocities of colliders a (`side` 0) or b (1) at every contact, (C, D, *batch) [m/s]."""
     so, points, rows_from = rotations(dv.shape[1]), _points(arms), len(arms.a) - _rows(arms)
-    (v_a, w_a), (v_b, w_b) = ([at_colliders(d, side, 0.0) for d in (dv, dw)] for side in (arms.a, arms.b))
-
-    def point_velocity(v: Array, w: Array, arm: Array) -> Array:
-        return v[:points] + jax.vmap(so.cross)(w[:points], arm[:points])
-
-    parts = [point_velocity(v_a, w_a, arms.arm_a) - point_velocity(v_b, w_b, arms.arm_b)]
+    ends, arm = ((arms.a, arms.arm_a), (arms.b, arms.arm_b))[side]
+    v, w = at_colliders(dv, ends, 0.0), at_colliders(dw, ends, 0.0)
+    parts = [v[:points] + jax.vmap(so.cross)(w[:points], arm[:points])]
     if arms.spin is not None:
-        parts.append(_as_vectors(w_a[points:rows_from] - w_b[points:rows_from], so.D))
+        parts.append(_as_vectors(w[points:rows_from], so.D))
     if arms.jac is not None:
-        twists = jnp.stack([jnp.concatenate([d[rows_from:] for d in pair], 1) for pair in ((v_a, w_a), (v_b, w_b))], 1)
-        parts.append(_first((arms.jac * twists).sum((1, 2)), so.D))
+        rates = (arms.jac[:, side] * jnp.concatenate([v[rows_from:], w[rows_from:]], 1)).sum(1)
+        parts.append(_first(rates if side == 0 else -rates, so.D))
     return _joined(parts)
 
 

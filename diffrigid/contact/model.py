@@ -66,7 +66,7 @@ class Contact:
         [0.3157, 0.3157, 0.3157]
     """
 
-    width: Leaf = array(default=0.0)
+    width: Leaf = array(default=0.0)  # None in a fit that smooths nothing: known when tracing to be exact
     rest_speed: Leaf = array(default=1e-3)
     sweeps: int = static(default=4)
     neighbours: int = static(default=8)

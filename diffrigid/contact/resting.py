@@ -40,7 +40,8 @@ def solve_impulses(
 ) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
-    A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `together.py`.
+    A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `together.py`,
+    which is not even compiled for a world where all are always alone, as one disc over a floor.
 
     Args:
         target: (C, *batch) [m/s] normal velocity after the impulse.
@@ -50,6 +51,8 @@ def solve_impulses(
         crowd: (N, *batch) number of active contacts of each body.
         rest_speed: (*batch) [m/s] what is slow in these worlds.
     """
+    if mobility.link is None and are_alone(strikes.a, strikes.b, len(crowd)):
+        return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu)
     others = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
     others = lax.stop_gradient(others)
     shared = strikes.active & ((others > 1) | (mobility.link is not None))
@@ -64,6 +67,12 @@ def solve_impulses(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, jac=strikes.jac, spin=strikes.spin, a=strikes.a, b=strikes.b
     )  # fmt: skip
     return alone + solve_together(some(shared), cone, strikes.v_rel, arms, mobility)
+
+
+def are_alone(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> bool:
+    """Whether no body is in more than one contact, of those between colliders a and b. Static."""
+    bodies = [i for i in a + b if i < moving]
+    return len(set(bodies)) == len(bodies)
 
 
 def _none(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:

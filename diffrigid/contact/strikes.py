@@ -92,7 +92,8 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
 
     The test costs a fraction of looking for impacts, and spares a step without them everything else.
     """
-    margin = 40.0 * world.contact.width  # beyond it a smooth impulse is below rounding, exp(-40)
+    width = world.contact.width
+    margin = 0.0 if width is None else 40.0 * width  # beyond it a smooth impulse is below rounding, exp(-40)
 
     def one(a: Side, b: Side) -> Array:
         a, b = lax.stop_gradient((a, b))

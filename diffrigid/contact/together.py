@@ -158,7 +158,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
     tolerance, least = 16.0 * rounding, rounding**0.6 * cone.rest_speed
 
     def busy(carry):
-        count, _, best, error, since = carry
+        count, *_, best, error, since = carry
         small = jnp.where(since < PATIENCE, tolerance, jnp.where(since < 5 * PATIENCE, 1e-3, jnp.inf))
         return (count < ROUNDS) & some(error > small * speed(best) + least)
 
@@ -169,31 +169,35 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         z = _excess(cone, P, v_rel, arms, mobility)
         return allowed(cone, P + (z - P) / cone.crowd[:, None])
 
-    def wrong(P):
-        return speed(allowed(cone, _excess(cone, P, v_rel, arms, mobility)) - P)
+    def lacking(P):
+        z = _excess(cone, P, v_rel, arms, mobility)
+        return z, allowed(cone, z) - P
 
     def roughly(P, since):
+        def wrong(P):
+            return speed(lacking(P)[1])
+
         return solve_roughly(cone, v_rel, arms, mobility, wrong, least), jnp.zeros_like(since)
 
     def again(carry):
-        count, P, best, error, since = carry
-        if mobility.inverse_mass.shape[0] >= PILE:
-            P, since = lax.cond(count == CIRCLES, roughly, lambda P, since: (P, since), P, since)
-        z = _excess(cone, P, v_rel, arms, mobility)
-        r = allowed(cone, z) - P
-        size = speed(r)
-        better = size < error
-        best, since = jnp.where(better[None, None], P, best), jnp.where(better, 0, since + 1)
+        count, P, z, r, best, error, since = carry
         slope = _slope(cone, z)
         matrix = bodies_matrix(_answer(slope, cone), arms, mobility)
         dP = _newton_step(r, lambda u: solve_regular(matrix, u[:, None])[:, 0], slope, cone, arms, mobility)
         P = lax.fori_loop(0, SMOOTHING, smoother, allowed(cone, P + dP))
-        return count + 1, P, best, jnp.minimum(size, error), since
+        if mobility.inverse_mass.shape[0] >= PILE:
+            P, since = lax.cond(count == CIRCLES, roughly, lambda P, since: (P, since), P, since)
+        z, r = lacking(P)
+        size = speed(r)
+        better = size < error
+        best, since = jnp.where(better[None, None], P, best), jnp.where(better, 0, since + 1)
+        return count + 1, P, z, r, best, jnp.minimum(size, error), since
 
     def iterate(nothing):
-        error = jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
-        start = (0, smoother(0, nothing), nothing, error, jnp.zeros_like(error, np.int32))
-        return lax.while_loop(busy, again, start)[2]
+        P = smoother(0, nothing)
+        z, r = lacking(P)
+        error = speed(r)
+        return lax.while_loop(busy, again, (0, P, z, r, P, error, jnp.zeros_like(error, np.int32)))[4]
 
     return lax.cond(shared, iterate, lambda nothing: nothing, jnp.zeros_like(v_rel))
 

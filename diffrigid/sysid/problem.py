@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from diffrigid import paths
 from diffrigid.compiling import QUICK, uncollected
 from diffrigid.devices import cut, devices, everywhere, join, over_devices, pieces_of
+from diffrigid.pytree import replace
 from diffrigid.state import State
 from diffrigid.step import aligned, scan_steps
 from diffrigid.sysid.clocks import states_at
@@ -50,7 +50,7 @@ class Data(NamedTuple):
     controls: dict[str, Array] | None  # (S, D or A, R) over each step
     measured: dict[str, Array]  # (K, size, R)
     weights: dict[str, Array]  # (K, size of the residual, R) 1 / standard deviation, 0 where missing
-    width: Any  # () [m] of smooth impacts
+    width: Any  # () [m] of smooth impacts; None: all are exact
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
         controls=jax.tree.map(lambda *values: _side_by_side(values), *acting),
         measured=stacked(lambda k, name: np.nan_to_num(_series(found[k], name).values)),
         weights=stacked(lambda k, name: known(found[k], name).astype(float)),
-        width=np.zeros(()),
+        width=None,
     )
     data = jax.tree.map(
         lambda a: jnp.asarray(a.astype(dtype if np.issubdtype(a.dtype, np.floating) else np.int32)), data
@@ -185,8 +185,8 @@ def _simulated(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
 def _simulated_here(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
     lanes = z.shape[1]
     scene = _lanes(plan.slots, data.scene, z)
-    world, _ = paths.write(scene.world, scene.state, "contact.width", data.width)
-    world, start = aligned(world, scene.state)
+    contact = replace(scene.world.contact, width=data.width)
+    world, start = aligned(replace(scene.world, contact=contact), scene.state)
     lengths = jnp.broadcast_to(data.lengths, (data.lengths.shape[0], lanes))
     states = scan_steps(world, start, lengths, data.controls, (1,) * lengths.shape[0])
     rows = []

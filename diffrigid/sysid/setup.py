@@ -84,14 +84,19 @@ def scene_of(run: Run) -> Scene:
 
 
 def with_noise(problem: Problem, noise: Mapping[str, float], window: float = np.inf, width: float = 0.0) -> Problem:
-    """The problem with weights for this noise, for the first `window` [s] of each record, and impacts this smooth."""
+    """The problem with weights for this noise, for the first `window` [s] of each record, and impacts this smooth [m].
+
+    Until one is smooth, none is compiled to be.
+    """
     groups = []
     for group in problem.groups:
         weights = {}
         for name, old in group.data.weights.items():
             rows = [_weights(problem.runs[k], name, noise, window, old.shape[0]) for k in group.members]
             weights[name] = jnp.asarray(np.stack(rows, axis=-1), old.dtype)
-        data = group.data._replace(weights=weights, width=jnp.asarray(width, group.data.width.dtype))
+        exact = width == 0 and group.data.width is None
+        width_now = None if exact else jnp.asarray(width, group.data.lengths.dtype)
+        data = group.data._replace(weights=weights, width=width_now)
         groups.append(replace(group, data=data))
     return replace(problem, groups=tuple(groups), noise=dict(noise))
 

@@ -21,8 +21,10 @@ function render({ model, el }) {
   for (const slider of model.get("sliders")) row(el, slider, (moved) => { model.set("moved", moved); model.save_changes(); });
   el.append(frame);
   const send = (end) => frame.contentWindow.postMessage({ runs: model.get("runs"), end }, "*");
-  frame.addEventListener("load", () => setTimeout(() => send(true), 500)); // when its scripts are unpacked
+  const ready = ({ source, data }) => { if (source === frame.contentWindow && data?.ready) send(true); };
+  window.addEventListener("message", ready); // from the player, when it is there
   model.on("change:runs", () => send(false));
+  return () => window.removeEventListener("message", ready);
 }
 
 export default { render };

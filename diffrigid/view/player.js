@@ -246,5 +246,6 @@ function makePlayer(data) {
   new ResizeObserver(draw).observe(stage);
   scene.refresh();
   show(scene.first);
+  if (window.parent !== window) window.parent.postMessage({ ready: true }, "*"); // to the page it is framed in
   return { scene, view, show, play, isPlaying: () => playing };
 }
