@@ -10,8 +10,8 @@ from jax import Array
 from diffrigid.contact.cone import put
 from diffrigid.contact.sides import at_colliders, between_bodies, side_sum
 from diffrigid.linkage import Linkage, spread
-from diffrigid.numerics import dot, identity, rows, unit_vector
-from diffrigid.pytree import array, pytree, static
+from diffrigid.numerics import LARGE, dot, fold, identity, rows, unit_vector
+from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import rotations
 
 
@@ -39,7 +39,8 @@ class Mobility:
 
     inverse_mass: Array = array("N")  # [1/kg]
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
-    link: Linkage | None = None  # of the joints between them
+    inertia: Any = None  # [kg m^2] world axes, where there are joints, and then
+    matrix: Any = array("R", "R", default=None)  # G whole, [1/kg], of the twists (D + A) of body after body
 
 
 def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
@@ -71,14 +72,36 @@ def _joined(parts: list[Array]) -> Array:
     return jnp.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
+def jointed(link: Linkage, inertia: Array) -> Mobility:
+    """Of bodies with joints, and inertias in world axes. G is used so often that it is made once, column by column."""
+    moving, *batch = link.inverse_mass.shape
+    D, size = link.groups[0].a.x.shape[1], link.sides.shape[3]
+    units = jnp.eye(moving * size, dtype=inertia.dtype).reshape(-1, moving, size, *[1] * len(batch))
+    units = units + jnp.zeros_like(link.inverse_mass)[None, :, None]
+    free = Mobility(inverse_mass=link.inverse_mass, inverse_inertia=link.inverse_inertia)
+
+    def twist(unit: Array) -> Array:
+        dv, dw, _ = velocities(free, unit[:, :D], unit[:, D:])
+        more = spread(link, dv, dw)
+        return jnp.concatenate([dv + more[0], dw + more[1]], axis=1).reshape(-1, *batch)
+
+    return replace(free, inertia=inertia, matrix=jax.vmap(twist, out_axes=1)(units))
+
+
 def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, Array]:
     """Changes of v [m/s], w [rad/s] and L by impulses dp and dL on the bodies, and by what the joints make of them."""
     apply = rotations(dp.shape[1]).apply
-    dv, dw = mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL)
-    if mobility.link is None:
-        return dv, dw, dL
-    more = spread(mobility.link, dv, dw)
-    return dv + more[0], dw + more[1], dL + more[2]
+    if mobility.matrix is None:
+        return mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL), dL
+    twist = _times(mobility.matrix, jnp.concatenate([dp, dL], axis=1).reshape(-1, *dp.shape[2:]))
+    dv, dw = jnp.split(twist.reshape(len(dp), -1, *dp.shape[2:]), [dp.shape[1]], axis=1)
+    return dv, dw, jax.vmap(apply)(mobility.inertia, dw)
+
+
+def _times(matrix: Array, u: Array) -> Array:
+    """(R, R, *batch) times (R, *batch)."""
+    parts = matrix * u[None]
+    return fold(jnp.add, parts, 1) if len(u) <= LARGE else parts.sum(1)
 
 
 def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
@@ -130,8 +153,12 @@ def moved(P: Array, arms: Any, mobility: Mobility) -> Array:
 
 def twists(P: Array, arms: Any, mobility: Mobility) -> Array:
     """G J^T P: the change of the twists of all bodies by impulses, (R, *batch)."""
-    dv, dw, _ = velocities(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
-    return jnp.concatenate([dv, dw], axis=1).reshape(-1, *P.shape[2:])
+    return _twists(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
+
+
+def _twists(mobility: Mobility, dp: Array, dL: Array) -> Array:
+    """The same by impulses dp (N, D, *batch) [N s] and dL (N, A, *batch) [N m s] on the bodies."""
+    return jnp.concatenate(velocities(mobility, dp, dL)[:2], axis=1).reshape(-1, *dp.shape[2:])
 
 
 def at_contacts(arms: Any, twist: Array) -> Array:
@@ -177,11 +204,7 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
         whole = whole + rows(across, between).sum(1).reshape(moving, moving, size, size, *batch)
     columns = jnp.moveaxis(whole, (1, 3), (0, 1)).reshape(moving * size, moving, size, *batch)
 
-    def twisted(column):
-        dv, dw, _ = velocities(mobility, column[:, :D], column[:, D:])
-        return jnp.concatenate([dv, dw], axis=1).reshape(-1, *batch)
-
-    matrix = jax.vmap(twisted, out_axes=1)(columns)
+    matrix = jax.vmap(lambda column: _twists(mobility, column[:, :D], column[:, D:]), out_axes=1)(columns)
     return identity(matrix) + matrix
 
 

@@ -27,14 +27,14 @@ from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
-from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
+from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
 from diffrigid.contact.resting import Strikes, solve_impulses
 from diffrigid.contact.rolling import rolling_stops, with_rows
 from diffrigid.contact.sides import at_colliders, body_sides, side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, is_rolling, may_meet
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
-from diffrigid.linkage import islands, linkage, spread
+from diffrigid.linkage import Linkage, islands, linkage, spread
 from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide, some, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
@@ -229,8 +229,8 @@ def _apply(
     own = side_sum(both, both, strikes.a, strikes.b, moving)
     count, total = jnp.moveaxis(_over_islands(jnp.sum, own, islands(world.joints, moving), 0.0), 1, 0)
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
-    q, mobility = _posed(world, flight, t)
-    onto = _onto_joints(flight, t, mobility, (count > 0) & (kick > 0))
+    q, mobility, link = _posed(world, flight, t)
+    onto = None if link is None else _onto_joints(flight, t, link, (count > 0) & (kick > 0))
     if onto is not None:
         strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
     crowd, stopped = own[:, 0], stopping_early
@@ -252,26 +252,25 @@ def _apply(
     return _anchored(anchors, flight, t, q, count > 0, kicked, moved)
 
 
-def _onto_joints(flight: Flight, t: Array, mobility: Mobility, hit: Array) -> tuple[Array, Array, Array] | None:
+def _onto_joints(flight: Flight, t: Array, link: Linkage, hit: Array) -> tuple[Array, Array, Array]:
     """Changes of v, w and L that bring the velocities of bodies that are `hit` (N, *batch) onto their joints.
 
     A flight leaves the joints by the error of its integration. Contacts cannot mend that: two that stick on two bodies
     of one linkage would press without bound.
     """
-    if mobility.link is None:
-        return None
     apply, on = rotations(flight.dim).apply, hit[:, None].astype(t.dtype)
     v, L = jax.vmap(velocity)(flight, t), jax.vmap(angular_momentum)(flight, t)
-    return spread(mobility.link, on * v, on * jax.vmap(apply)(mobility.inverse_inertia, L))
+    return spread(link, on * v, on * jax.vmap(apply)(link.inverse_inertia, L))
 
 
-def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility]:
-    """Orientations of all bodies, each at its own time t (N, *batch), and their mobility there."""
+def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility, Linkage | None]:
+    """Orientations of all bodies, each at its own time t (N, *batch), their mobility there, and their joints."""
     q, so = jax.vmap(orientation)(flight, t), rotations(flight.dim)
-    inverse, link = jax.vmap(so.world_inverse)(flight.inverse_inertia, q), None
     if world.joints:
         link = linkage(world.joints, world.statics, world.bodies, jax.vmap(position)(flight, t), q)
-    return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse, link=link)
+        return q, jointed(link, jax.vmap(so.world_inverse)(world.bodies.inertia, q)), link
+    inverse = jax.vmap(so.world_inverse)(flight.inverse_inertia, q)
+    return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse), None
 
 
 def _anchored(anchors: Anchors, flight: Flight, t, q, hit, kicked, moved) -> Anchors:

@@ -51,11 +51,11 @@ def solve_impulses(
         crowd: (N, *batch) number of active contacts of each body.
         rest_speed: (*batch) [m/s] what is slow in these worlds.
     """
-    if mobility.link is None and are_alone(strikes.a, strikes.b, len(crowd)):
+    if mobility.matrix is None and are_alone(strikes.a, strikes.b, len(crowd)):
         return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu)
     others = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
     others = lax.stop_gradient(others)
-    shared = strikes.active & ((others > 1) | (mobility.link is not None))
+    shared = strikes.active & ((others > 1) | (mobility.matrix is not None))
     by_itself = strikes.active & ~shared
     alone = lax.cond(some(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu)
     scale = lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
