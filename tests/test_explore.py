@@ -83,6 +83,8 @@ def test_a_slider_of_the_widget_moves_the_motion(explorer):
     assert explorer.values["restitution"] == 0.25
     assert [run["name"] for run in widget.runs] == ["motion", "its slope by restitution, + 0.05"]
     assert not widget.runs[1]["contacts"]["rows"]
+    shown, _ = explorer._repr_mimebundle_()
+    assert "<iframe" in shown["text/html"] and "application/vnd.jupyter.widget-view+json" in shown
 
 
 MODEL = """
@@ -112,7 +114,7 @@ def test_in_a_browser(explorer, tmp_path, dim):
         world, state = dr.scene({"ball": ball}, gravity=(0.0, 0.0, -G))
         explorer = dr.explore(world, state, {"ball.v[0]": (-2.0, 2.0)}, dt=1 / RATE, steps=STEPS)
     name = "ball.v[0]"
-    start = {"page": explorer.page(), "sliders": explorer.sliders(), "runs": explorer.sources()}
+    start = {"page": explorer.player().page, "sliders": explorer.sliders(), "runs": explorer.sources()}
     script = widget.Sliders._esm if isinstance(widget.Sliders._esm, str) else str(widget.Sliders._esm)
     model = MODEL % json.dumps(start).replace("</", "<\\/")
     page = tmp_path / "explore.html"

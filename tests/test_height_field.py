@@ -207,13 +207,12 @@ FLAT = dr.Static(dr.HeightField(heights=np.full((7, 5), 0.1), spacing=0.4, cells
 FLOOR = dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))
 
 
-@pytest.mark.parametrize("kind", [dr.Sphere, dr.Box])
-def test_on_a_flat_grid_is_on_a_half_space(kind):
-    """States of a ball, or a box, that bounces, tumbles and slides."""
+def test_on_a_flat_grid_is_on_a_half_space():
+    """States of a box that bounces, tumbles and slides."""
 
     def thrown(ground):
         x, v, w = (0.05, 0.03, 0.9), (1.0, 0.3, 0.0), (1.0, 2.0, 0.5)
-        return dr.rollout(*scene_of(ground, SHAPES[kind], x, v, 0.4, 0.3, w=w), dt=1 / 60, steps=48).state
+        return dr.rollout(*scene_of(ground, SHAPES[dr.Box], x, v, 0.4, 0.3, w=w), dt=1 / 60, steps=48).state
 
     jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-8), thrown(FLAT), thrown(FLOOR))
 

@@ -42,12 +42,20 @@ def check_with_slopes(got, expected, cases, derivative):
     jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), both(got), both(expected))
 
 
-def rolling(dim, mu, c, v, slope, t):
-    """Way of a ball on a plane that falls ahead by `slope`, which it does not leave."""
+def rolling(dim, mu, c, v, slope, t, about=0.0, w=0.0):
+    """Way of a ball on a plane that falls ahead by `slope`, which it does not leave, and its turn about the normal.
+
+    Args:
+        about: [m] spinning friction, in space. w: [rad/s] with which it spins.
+    """
     ahead, up = np.eye(dim)[0], np.eye(dim)[-1]
-    bodies = {"ball": ball(dim, v, jnp.where(mu > 0.4, v / RADIUS, 0.0)), "floor": floor(dim)}
+    rolls = ball(dim, v, jnp.where(mu > 0.4, v / RADIUS, 0.0))
+    if dim == 3:
+        rolls = dr.replace(rolls, w=rolls.w + w * up)
     gravity = G * (jnp.sin(slope) * ahead - jnp.cos(slope) * up)
-    return at(t, dr.scene(bodies, gravity=gravity, friction=mu, rolling_friction=c)).x[0]
+    kinds = {"rolling_friction": c} | ({"spinning_friction": about} if dim == 3 else {})
+    end = at(t, dr.scene({"ball": rolls, "floor": floor(dim)}, gravity=gravity, friction=mu, **kinds))
+    return jnp.stack([end.x[0], 2 * jnp.arctan2(end.q[-1], end.q[0])])
 
 
 def rolls(dim, mu, c, v, slope, t):
@@ -74,37 +82,49 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("dim, derivative", [(2, jax.jacrev), (3, jax.jacfwd)])
-def test_a_ball_on_a_plane(dim, derivative):
-    """A batch of cases, and slopes by both frictions, speed, slope and time."""
+def spins(about, w, t):
+    """Turned about the normal until t: it stops after I w / (about m g)."""
+    braking = about * G / (SHARE[3] * RADIUS**2)
+    turns = jnp.minimum(t, w / braking)
+    return w * turns - 0.5 * braking * turns**2
+
+
+SPINS = {"spins on": (0.004, 2.0, 1.0), "stops spinning within a step": (0.02, 2.0, 0.97)}
+
+
+def motions(dim, derivative, rows):
+    """Of balls on a plane, and their slopes by all numbers, compiled once."""
 
     def both(row):
         value, slopes = with_slopes(lambda *row: rolling(dim, *row), derivative)(*row)
         return value, jnp.stack(slopes)
 
-    values, slopes = jax.jit(jax.vmap(both))(jnp.array([row for _, row in CASES.values()]))
-    for (name, (law, row)), value, slope in zip(CASES.items(), values, slopes, strict=True):
+    return jax.jit(jax.vmap(both))(jnp.array(rows))
+
+
+def check_ways(dim, values, slopes):
+    for (name, (law, row)), value, slope in zip(CASES.items(), values[:, 0], slopes[:, :5, 0], strict=True):
         true_slope = jnp.stack(jax.jacfwd(law, tuple(range(1, 6)))(dim, *row))
         seen = np.array([True, True, row[2] > 0.0, True, True])  # at rest the slope by speed has two sides
         assert_allclose(value, law(dim, *row), atol=EXACT, err_msg=name)
         assert_allclose(slope[seen], true_slope[seen], atol=EXACT, err_msg=name)
 
 
-def test_a_sphere_stops_spinning():
-    """After I w / (c m g), within a step; the angle it has turned by."""
+def test_a_disc_on_a_plane():
+    """A batch of cases, and slopes by both frictions, speed, slope and time, in reverse mode."""
+    check_ways(2, *motions(2, jax.jacrev, [row for _, row in CASES.values()]))
 
-    def angle(c, w, t):
-        spinning = dr.replace(ball(3), w=vector(0.0, 0.0, 1.0) * w)
-        world = dr.scene({"ball": spinning, "floor": floor(3)}, gravity=(0.0, 0.0, -G), spinning_friction=c)
-        q = at(t, world).q
-        return 2 * jnp.arctan2(q[3], q[0])
 
-    def expected(c, w, t):
-        braking = c * G / (SHARE[3] * RADIUS**2)
-        spins = jnp.minimum(t, w / braking)
-        return w * spins - 0.5 * braking * spins**2
-
-    check_with_slopes(angle, expected, [(0.004, 2.0, 1.0), (0.02, 2.0, 0.97)], jax.jacfwd)
+def test_a_ball_on_a_plane():
+    """The same cases and two that spin on the spot, and slopes, in forward mode."""
+    rows = [(*row, 0.01, 0.0) for _, row in CASES.values()] + [
+        (0.5, 0.0, 0.0, 0.0, t, c, w) for c, w, t in SPINS.values()
+    ]
+    values, slopes = motions(3, jax.jacfwd, rows)
+    check_ways(3, values[: len(CASES)], slopes[: len(CASES)])
+    for (name, row), value, slope in zip(SPINS.items(), values[len(CASES) :], slopes[len(CASES) :], strict=True):
+        assert_allclose(value[1], spins(*row), atol=EXACT, err_msg=name)
+        assert_allclose(slope[np.array([5, 6, 4]), 1], jax.jacfwd(spins, (0, 1, 2))(*row), atol=EXACT, err_msg=name)
 
 
 def test_an_impact_stops_some_of_the_turning():

@@ -26,9 +26,7 @@ from diffrigid.so2 import perp
 from diffrigid.so3 import tangents
 from diffrigid.state import rotations
 
-JAMMED = (
-    1e-3  # [-] of the normal mobility: where sliding would close the contact as fast as its normal impulse opens it
-)
+JAMMED = 1e-3  # [-] of the normal mobility: sliding would close the contact as fast as its normal impulse opens it
 
 
 def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -> Array:

@@ -60,7 +60,7 @@ def load_urdf(
     links: list[Link] = []
     places: dict[str, tuple[Link, Frame]] = {}  # of each link: the one that it is part of, and where in it
     names: set[str] = set()
-    for name in _ordered(where, elements, joints, left_out):
+    for name in _ordered(where, elements, joints):
         element, moved_by = elements[name], joints.get(name)
         mass, geometry = _mass(where, name, element), _geometry(where, name, element, float(friction), left_out)
         link, place = _link(where, name, moved_by, places, mass, geometry, left_out, floating, names)
@@ -91,7 +91,7 @@ def _link(where, name, element, places, mass, geometry, left_out, floating, name
     return Link(unique, owner.frame @ origin, owner.name, joint, mass, geometry, still), _WHOLE
 
 
-def _ordered(where: str, elements: dict, joints: dict, left_out: list[str]) -> list[str]:
+def _ordered(where: str, elements: dict, joints: dict) -> list[str]:
     """Names of the links, parents first, from the one root."""
     roots = [name for name in elements if name not in joints]
     if len(roots) != 1:

@@ -170,7 +170,7 @@ def finish(
     uncertainty = intervals(linear)
     scenes = tuple(fitted_scenes(problem, shared, own))
     residuals = tuple(by_column(problem, point, best))
-    parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, scenes)
+    parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals)
     order = np.argsort(costs)
     summary = Summary(
         parameters=parameters, noise=_all_noise(problem), costs=costs[order],

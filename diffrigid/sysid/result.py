@@ -163,9 +163,7 @@ class Fit:
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
         uncertainty = intervals(self.linear)
-        parameters, notes = describe(
-            self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.scenes
-        )
+        parameters, notes = describe(self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals)
         summary = replace(self.summary, parameters=parameters, notes=notes)
         return replace(self, summary=summary, uncertainty=uncertainty)
 
@@ -198,7 +196,7 @@ class Fit:
 
 def describe(
     problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
-    residuals: tuple[dict[str, np.ndarray], ...], scenes: tuple[Scene, ...],
+    residuals: tuple[dict[str, np.ndarray], ...],
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """The parameters with intervals, and the notes under the table."""
     places = coordinates((*problem.shared, *problem.own), references(problem))

@@ -19,7 +19,7 @@ from diffrigid.compiling import QUICK, uncollected
 from diffrigid.state import State
 from diffrigid.step import Trajectory, at_least_one, floats, rollout, step_length
 from diffrigid.view.frames import record
-from diffrigid.view.play import play
+from diffrigid.view.play import Player, play
 from diffrigid.world import World, check
 
 AHEAD = 0.05  # of the range of a parameter: how far its slope is followed
@@ -88,12 +88,14 @@ class Explorer:
         """What the player draws of both; contacts of the motion only."""
         return [record(run, name, None, FRAMES, run is self.trajectory) for name, run in self.runs().items()]
 
-    def page(self) -> str:
-        """The page of the player."""
-        return play(self.runs(), frames=FRAMES, show=("trails", "contacts"), plot="").page
+    def player(self) -> Player:
+        """Both motions as they are now."""
+        return play(self.runs(), frames=FRAMES, show=("trails", "contacts"), plot="")
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        return self.widget._repr_mimebundle_(**options)
+        """The widget; where no kernel runs, the motions as they were."""
+        data, metadata = self.widget._repr_mimebundle_(**options)
+        return data | {"text/html": self.player()._repr_html_()}, metadata
 
 
 def explore(

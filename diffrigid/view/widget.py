@@ -24,7 +24,7 @@ class Sliders(anywidget.AnyWidget):
 
 def widget_of(explorer: Explorer) -> Sliders:
     """Sliders that move the explorer, and show its motions."""
-    widget = Sliders(page=explorer.page(), sliders=explorer.sliders(), runs=explorer.sources())
+    widget = Sliders(page=explorer.player().page, sliders=explorer.sliders(), runs=explorer.sources())
 
     def follow(change: Any) -> None:
         explorer.move(change["new"]["name"], change["new"]["value"])
