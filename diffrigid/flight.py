@@ -53,7 +53,8 @@ def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Fli
     so = rotations(bodies.dim)
     inverse = jax.vmap(so.inverse_inertia)(bodies.inertia)
     L = spin(bodies, state)
-    wrench = Wrench(F=jnp.zeros_like(state.v), tau=None) if varies else _wrench(world, state, controls)
+    still = Wrench(F=jnp.zeros_like(state.v), tau=None)  # until the stages of Runge-Kutta
+    wrench = still if varies else total_wrench(world.forces, bodies, state, controls)
     flight = Flight(
         t0=t0, x=state.x, q=state.q, v=state.v, L=L, a=wrench.F / bodies.mass[:, None], tau=wrench.tau,
         turn=jax.vmap(so.turn_series)(inverse, state.q, L, wrench.tau), inverse_mass=1.0 / bodies.mass,
@@ -64,10 +65,10 @@ def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Fli
     return _along(flight, *_runge_kutta(world, flight, controls, t1[None] - t0), t1[None] - t0, _has_torque(world))
 
 
-def _wrench(world: Any, state: State, controls: Any) -> Wrench:
-    """All forces on free bodies, and those of the joints."""
+def _wrench(world: Any, state: State, controls: Any, span: Array) -> Wrench:
+    """All forces on free bodies, and those of the joints, for an integration over span (*batch) [s]."""
     wrench = total_wrench(world.forces, world.bodies, state, controls)
-    return joint_wrench(world.joints, world.statics, world.bodies, state, wrench) if world.joints else wrench
+    return joint_wrench(world.joints, world.statics, world.bodies, state, wrench, span) if world.joints else wrench
 
 
 @pytree
@@ -104,7 +105,7 @@ def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion
 
     def rates(motion):
         state = placed(motion)
-        wrench = _wrench(world, state, controls)
+        wrench = _wrench(world, state, controls, T.max(0))
         tau = jnp.zeros_like(motion.L) if wrench.tau is None else wrench.tau
         return Motion(x=motion.v, phi=turning(motion, state), v=f.inverse_mass[:, None] * wrench.F, L=tau)
 

@@ -35,6 +35,8 @@ from diffrigid.numerics import apart, dot, opaque_true, rows_or_zeros
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, rotations
 
+STRONGEST = 1.2  # [-] rate of damping times a step; several on one body add up, and with 2.8 the method is unstable
+
 
 def islands(joints: tuple, moving: int) -> tuple[tuple[int, ...], ...]:
     """The bodies that hang together with each body by joints, itself included; moving bodies only."""
@@ -164,12 +166,12 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
     return moved[:, :D], moved[:, D:], forced[:, D:]
 
 
-def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench) -> Wrench:
-    """The forces of a world with those added that keep its joints."""
+def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench, span: Array) -> Wrench:
+    """The forces of a world with those added that keep its joints, for an integration over span (*batch) [s]."""
     state = apart(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
-    given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1))
+    given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1), span)
     gyroscopic = jax.vmap(so.gyroscopic)(bodies.inertia, state.q, state.w)
     free = _moved(link, given - jnp.pad(gyroscopic, [(0, 0), (so.D, 0), *[(0, 0)] * (given.ndim - 2)]))
 
@@ -186,20 +188,36 @@ def _twists(state: State) -> Array:
     return jnp.concatenate([state.v, state.w], axis=1)
 
 
-def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array) -> Array:
+def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array, span: Array) -> Array:
     """Forces and torques on all bodies (N, D + A, *batch) with those added of the damping of joints."""
     so = rotations(link.groups[0].a.x.shape[1])
 
-    def resisting(joint: Any, a: Pose, b: Pose, u: Array) -> Array:
+    def resisting(joint: Any, a: Pose, b: Pose, u: Array, mass: Array, inertia: Array) -> Array:
         along = by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0].reshape(u.shape)
-        return -(joint.damping * (along * u).sum((0, 1)))[None, None] * along
+        turn = along[:, so.D :]
+        mobile = (mass * (along[:, : so.D] ** 2).sum(1)).sum(0) + (turn * jax.vmap(so.apply)(inertia, turn)).sum((0, 1))
+        damping = joint.damping * resolved(joint.damping * mobile * span)
+        return -(damping * (along * u).sum((0, 1)))[None, None] * along
 
     for group, at in zip(joints, link.groups, strict=True):
         if getattr(group, "damping", None) is not None:
             ends = ends_of((group,))
-            resistance = of_each(resisting, (at,), to_sides(ends, twists))
+            of_both = (to_sides(ends, leaf) for leaf in (twists, link.inverse_mass, link.inverse_inertia))
+            resistance = of_each(resisting, (at,), *of_both)
             forces = forces + _by_body(ends, len(forces), resistance)
     return forces
+
+
+def resolved(steps: Array) -> Array:
+    """The share of a damping, by its rate times the length of a step, that Runge-Kutta can integrate, (*batch).
+
+    All of it, to a smaller error than that of the method, until it acts within about a step, STRONGEST; and no more:
+    a joint that is damped a thousand times as much would be thrown about, and is stopped within some steps instead.
+    """
+    ratio = steps / STRONGEST
+    large = ratio > 1.0
+    small = jnp.where(large, 1.0 / jnp.where(large, ratio, 1.0), ratio)
+    return jnp.where(large, small, 1.0) / (1.0 + small**8) ** 0.125
 
 
 def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> State:

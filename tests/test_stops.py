@@ -69,6 +69,13 @@ def test_damping_is_exponential():
     )
 
 
+def test_a_damping_that_no_step_resolves_stops_the_joint():
+    """It acts within a thousandth of a step: an explicit integration would throw the wheel about, without bound."""
+    value, slope = jax.jit(with_slopes(lambda damping: turned(wheel(1.7, damping=damping), 1.0)))(jnp.asarray(3e4))
+    assert abs(value[1]) < 1e-9 and abs(value[0]) < 2 * 1.7 / RATE
+    assert np.isfinite(np.asarray(slope)).all()
+
+
 def test_a_hinge_in_space_stops_as_in_the_plane():
     along = {"upper": 1.0, "restitution": 0.6, "friction": 0.1, "damping": 0.02}
     flat, space = (jax.jit(lambda w, dim=dim: turned(wheel(w, dim, **along), 1.0))(1.7) for dim in (2, 3))
