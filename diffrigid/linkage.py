@@ -196,7 +196,7 @@ def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array, span: Ar
         along = by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0].reshape(u.shape)
         turn = along[:, so.D :]
         mobile = (mass * (along[:, : so.D] ** 2).sum(1)).sum(0) + (turn * jax.vmap(so.apply)(inertia, turn)).sum((0, 1))
-        damping = joint.damping * resolved(joint.damping * mobile * span)
+        damping = joint.damping * _resolved(joint.damping * mobile * span)
         return -(damping * (along * u).sum((0, 1)))[None, None] * along
 
     for group, at in zip(joints, link.groups, strict=True):
@@ -208,7 +208,7 @@ def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array, span: Ar
     return forces
 
 
-def resolved(steps: Array) -> Array:
+def _resolved(steps: Array) -> Array:
     """The share of a damping, by its rate times the length of a step, that Runge-Kutta can integrate, (*batch).
 
     All of it, to a smaller error than that of the method, until it acts within about a step, STRONGEST; and no more:

@@ -17,11 +17,12 @@ def restitution_at(e, c, u):
     return e * (1 + c * u) ** (-0.25)
 
 
-def drop(h, e, c):
+def drop(dim, h, e, c, **at):
     """Height of a ball at the top of its first bounce, above where it touches the floor."""
-    up = vector(0.0, 1.0)
+    up = vector(*[0.0] * (dim - 1), 1.0)
+    shape = (dr.Disc if dim == 2 else dr.Sphere)(radius=RADIUS)
     bodies = {
-        "ball": dr.Body(dr.Disc(radius=RADIUS), mass=1.3, x=(RADIUS + h) * up, restitution_falloff=c),
+        "ball": dr.Body(shape, mass=1.3, x=(RADIUS + h) * up, restitution_falloff=c),
         "floor": dr.Static(dr.HalfSpace(normal=up)),
     }
     world, state = dr.scene(bodies, gravity=-G * up, restitution=e)
@@ -31,15 +32,16 @@ def drop(h, e, c):
     return dr.rollout(world, state, dt=1 / 60, times=times, substeps=(60,)).state.x[-1, 0] @ up - RADIUS
 
 
-def test_bounces_of_several_drops():
+@pytest.mark.parametrize("dim, derivative", [(2, jax.jacrev), (3, jax.jacfwd)])
+def test_bounces_of_several_drops(dim, derivative):
     """e^2 h with e at the speed of each, for a batch of drops, and slopes by height, restitution and fall-off."""
 
     def both(height):
-        return jax.vmap(with_slopes(height, jax.jacrev))
+        return jax.vmap(with_slopes(height, derivative))
 
     h = jnp.array([0.02, 0.3, 1.0, 2.0])
     e, c = jnp.full_like(h, 0.9), jnp.array([0.0, 0.5, 0.5, 3.0])  # 0 is constant
-    got = jax.jit(both(drop))(h, e, c)
+    got = jax.jit(both(lambda h, e, c: drop(dim, h, e, c)))(h, e, c)
     expected = both(lambda h, e, c: restitution_at(e, c, jnp.sqrt(2 * G * h)) ** 2 * h)(h, e, c)
     jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), got, expected)
 

@@ -39,8 +39,8 @@ class Mobility:
 
     inverse_mass: Array = array("N")  # [1/kg]
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
-    inertia: Any = None  # [kg m^2] world axes, where there are joints, and then
-    matrix: Any = array("R", "R", default=None)  # G whole, [1/kg], of the twists (D + A) of body after body
+    matrix: Any = array("R", "R", default=None)  # G whole, where there are joints: twists (D + A) of body after body
+    inertia: Any = None  # [kg m^2] world axes; with `matrix` only
 
 
 def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
