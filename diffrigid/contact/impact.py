@@ -68,7 +68,7 @@ def find_impact(
         s (*batch) [s]; hit (*batch) bool, it happens before t1; level (*batch) [m] of the gap at which it
         happens; slack (*batch) [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size;
         rests (*batch) bool, some contact rests from the start: it is no impact, nor does it hide that of another.
-            False where `at_end`.
+        False where `at_end`.
 
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
     """
