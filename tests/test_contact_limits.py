@@ -128,24 +128,25 @@ def test_flat_box_rebounds_flat():
         jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), state, exact)
 
 
+def box_on_floor(seconds, half, x, v, e, mu, w=(0.0, 0.0, 0.0)):
+    """States of a box in space, one program for each second."""
+    box = dr.Body(dr.Box(half=half), mass=2.0, x=x, v=v, w=w)
+    floor = dr.Static(dr.HalfSpace(normal=vector(0.0, 0.0, 1.0)))
+    world, state = dr.scene({"box": box, "floor": floor}, gravity=(0.0, 0.0, -G), restitution=e, friction=mu)
+    parts = [jax.tree.map(lambda leaf: leaf[None], state)]
+    for _ in range(seconds):
+        last = jax.tree.map(lambda leaf: leaf[-1], parts[-1])
+        parts.append(jax.tree.map(lambda leaf: leaf[1:], dr.rollout(world, last, dt=1 / 60, steps=60).state))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
 def test_flat_box_rebounds_flat_and_then_rests_in_space():
     """Four corners at once; between the first two impacts, and long after the last."""
-
-    @jax.jit
-    def states(mu):
-        half = vector(0.3, 0.4, 0.1)
-        box = dr.Body(dr.Box(half=half), mass=2.0, x=vector(1.0, 2.0, 0.3), v=vector(0.0, 0.0, -1.0))
-        floor = dr.Static(dr.HalfSpace(normal=vector(0.0, 0.0, 1.0)))
-        world, state = dr.scene(
-            {"box": box, "floor": floor}, gravity=vector(0.0, 0.0, -G), restitution=0.5, friction=mu
-        )
-        return dr.rollout(world, state, dt=1 / 60, steps=240).state
-
     speed, hit = fall(0.2, -1.0, G)
     between = slice(8, 21)  # frames after the first impact, at 0.12 s, and before the second, at 0.35 s
     after = np.arange(61)[between] / 60 - hit
     for mu in (0.0, 0.4):
-        s = states(mu)
+        s = box_on_floor(4, (0.3, 0.4, 0.1), (1.0, 2.0, 0.3), (0.0, 0.0, -1.0), 0.5, mu)
         assert_allclose(s.x[between, 0, 2], 0.1 + 0.5 * speed * after - G * after**2 / 2, atol=EXACT)
         assert_allclose(s.v[between, 0, 2], 0.5 * speed - G * after, atol=EXACT)
         assert_allclose(s.w, 0.0, atol=EXACT)
@@ -281,12 +282,7 @@ def test_slopes_after_an_impact_at_the_very_end_of_a_step():
 def test_a_corner_that_rests_hides_no_impact_of_another():
     """A box that comes to rest on corners and edges, by turns: every other corner is struck in the step in which it lands."""
     half = np.array([0.5, 0.3, 0.2])
-    box = dr.Body(
-        dr.Box(half=half), mass=1.3, x=vector(0.0, 0.0, 0.9), v=vector(1.0, 0.3, 0.0), w=vector(1.0, 2.0, 0.5)
-    )
-    floor = dr.Static(dr.HalfSpace(normal=vector(0.0, 0.0, 1.0)))
-    world, state = dr.scene({"box": box, "floor": floor}, gravity=vector(0.0, 0.0, -G), restitution=0.4, friction=0.3)
-    s = dr.rollout(world, state, dt=1 / 60, steps=60).state
+    s = box_on_floor(1, half, (0.0, 0.0, 0.9), (1.0, 0.3, 0.0), 0.4, 0.3, w=(1.0, 2.0, 0.5))
     corners = half * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
     rotate = jax.vmap(jax.vmap(dr.state.rotations(3).rotate, (None, 0)), (0, None))
     lowest = s.x[:, 0, 2] + rotate(s.q[:, 0], jnp.asarray(corners))[..., 2].min(1)

@@ -67,13 +67,11 @@ def found(name):
     return False
 
 
-@pytest.mark.slow
 def test_every_public_name_has_an_entry(site):
     page = (site / "api.html").read_text()
     assert [name for name in dr.__all__ if f'id="diffrigid.{name}"' not in page] == []
 
 
-@pytest.mark.slow
 def test_pages_load_nothing_from_elsewhere(site):
     pages = [*site.glob("*.html")]
     assert {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")} < {page.stem for page in pages}
@@ -86,14 +84,12 @@ def test_pages_load_nothing_from_elsewhere(site):
         assert "@import" not in text and not re.search(r"url\(['\"]?(https?:)?//", text), style.name
 
 
-@pytest.mark.slow
 def test_formulas_are_drawn_and_nothing_was_executed(site):
     page = (site / "equations.html").read_text()
     assert page.count("<math") > 50 and "$" not in re.sub(r"<(script|style).*?</\1>", "", page, flags=re.S)
     assert not [*site.rglob("reports")]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.splitlines()[0])
 def test_the_same_scene_elsewhere_gives_what_the_page_says(section):
     """Where the simulator is installed; in a process of its own, with its own settings."""

@@ -207,6 +207,7 @@ FLAT = dr.Static(dr.HeightField(heights=np.full((7, 5), 0.1), spacing=0.4, cells
 FLOOR = dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))
 
 
+@pytest.mark.slow
 def test_on_a_flat_grid_is_on_a_half_space():
     """States of a box that bounces, tumbles and slides."""
 
@@ -220,7 +221,7 @@ def test_on_a_flat_grid_is_on_a_half_space():
 LINE = np.array([(0.0, 0.5), (0.5, 0.5), (1.0, 0.1), (1.5, 0.0), (2.0, 0.4), (2.5, 0.2), (3.0, 0.2)])
 
 
-@pytest.mark.parametrize("kind", [dr.Sphere, dr.Box])
+@pytest.mark.parametrize("kind", [pytest.param(dr.Sphere, marks=pytest.mark.slow), dr.Box])
 def test_a_profile_drawn_out_is_its_twin_in_the_plane(kind):
     """A ball, or a box that is wide across, that bounces, slides and turns over the same ground."""
     x, v, w, mass, inertia = (0.7, 1.2), (0.8, -0.5), -3.0, 1.3, 0.02

@@ -57,6 +57,7 @@ def test_the_fast_way_is_the_general_way(worlds, monkeypatch):
     assert_allclose(sum(products), slope, rtol=100 * ROUNDING)
 
 
+@pytest.mark.slow
 def test_spheres_go_the_fast_way_as_well(monkeypatch):
     """Four that tumble, of unequal principal inertias, between six walls."""
     rng = np.random.default_rng(5)

@@ -40,7 +40,6 @@ def job(tmp_path_factory):
     return path.read_text(encoding="utf-8"), table
 
 
-@pytest.mark.slow
 def test_discs_give_back_what_was_put_in(job):
     rows = {name: values for name, values in job[1].items() if name.startswith("discs")}
     assert len(rows) == 4
@@ -50,7 +49,6 @@ def test_discs_give_back_what_was_put_in(job):
         assert high - low < 0.01 * max(abs(truth), 0.5)  # 3 mm on 1 m, 121 times
 
 
-@pytest.mark.slow
 def test_square_agrees_with_what_was_published(job):
     rows = {name: values for name, values in job[1].items() if name.startswith("square")}
     assert set(rows) == set(PUBLISHED)
@@ -61,7 +59,6 @@ def test_square_agrees_with_what_was_published(job):
     assert rows["square: radius of gyration"][1] < 24.5 < rows["square: radius of gyration"][2]
 
 
-@pytest.mark.slow
 def test_report_is_one_closed_page_that_loads_nothing(job):
     text, page = job[0], parsed(job[0])
     assert {"table", "svg", "figure", "details"} <= set(page.tags)
@@ -74,7 +71,6 @@ def table(packed):
     return np.where(whole == 65535, np.nan, np.array(packed["low"]) + np.array(packed["step"]) * whole)
 
 
-@pytest.mark.slow
 def test_players_show_the_fit_over_what_was_measured(job):
     """Fitted and measured centres agree to 4 mm for the square, and to 5 sigma for the discs."""
     pages = [html.unescape(page) for page in re.findall(r'srcdoc="([^"]*)"', job[0])]

@@ -1,8 +1,7 @@
-"""Notebooks as they are committed; and run afresh: the first one, or with NOTEBOOKS=all every one."""
+"""Notebooks as they are committed; and run afresh: the first one, the others where slow tests are."""
 
 import ast
 import json
-import os
 import re
 from pathlib import Path
 
@@ -76,12 +75,11 @@ def test_it_says_nothing_of_the_machine(path):
     assert not [cell for cell in cells(path, "code") if "execution" in cell["metadata"]], "times of execution"
 
 
-def run_by_default(number, path):
-    skip = pytest.mark.skipif(os.environ.get("NOTEBOOKS") != "all", reason="run by NOTEBOOKS=all")
-    return pytest.param(path, marks=[pytest.mark.slow, skip] if number else [pytest.mark.slow], id=path.stem)
+def slow_but_the_first(number, path):
+    return pytest.param(path, marks=[pytest.mark.slow] if number else [], id=path.stem)
 
 
-@pytest.mark.parametrize("path", [run_by_default(number, path) for number, path in enumerate(BOOKS)])
+@pytest.mark.parametrize("path", [slow_but_the_first(number, path) for number, path in enumerate(BOOKS)])
 def test_it_runs(path):
     """Needs the extra `notebook`. All of them take about eight minutes."""
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")

@@ -32,7 +32,7 @@ def drop(dim, h, e, c, **at):
     return dr.rollout(world, state, dt=1 / 60, times=times, substeps=(60,)).state.x[-1, 0] @ up - RADIUS
 
 
-@pytest.mark.parametrize("dim, derivative", [(2, jax.jacrev), (3, jax.jacfwd)])
+@pytest.mark.parametrize("dim, derivative", [(2, jax.jacrev), pytest.param(3, jax.jacfwd, marks=pytest.mark.slow)])
 def test_bounces_of_several_drops(dim, derivative):
     """e^2 h with e at the speed of each, for a batch of drops, and slopes by height, restitution and fall-off."""
 

@@ -2,7 +2,6 @@
 
 import jax
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -43,7 +42,6 @@ def ball(restitution, friction, inertia, radius, drag, gravity, motion):
     )  # fmt: skip
 
 
-@pytest.mark.slow
 def test_a_bouncing_ball_tells_eleven_parameters():
     random, t = np.random.default_rng(0), np.arange(121) / 80
     motion = {"x": (0.0, 0.6), "v": (1.2, 0.4), "w": 6.0, "angle": 0.3}
@@ -242,7 +240,6 @@ def swing(times, friction, damping):
     return np.interp(times, h * np.arange(len(path)), path)
 
 
-@pytest.mark.slow
 def test_a_hinge_that_rubs_tells_dry_friction_from_damping():
     """Three seconds in which swings shorten by a constant, which is dry friction, and by a share, which is damping.
 
