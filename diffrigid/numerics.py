@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-LARGE = 40  # rows of a matrix, from which on a library that does one after the other is faster than all at once
+SMALL = 9  # rows of a matrix, up to which all of a batch at once are faster than a library that takes one by one
+FEW, MANY = 12, 40  # terms of a sum that is written out: where there are many such sums, where there are few
 FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
 
 
@@ -86,7 +87,8 @@ def sum_rows(values: Array, index: tuple) -> Array:
         part = values[start : start + length * len(runs)]
         sums = fold(jnp.add, part.reshape(len(runs), length, *part.shape[1:]), 1)
     else:
-        sums = rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), distinct).sum(1)
+        table = rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), distinct)
+        sums = fold(jnp.add, table, 1) if len(distinct[0]) <= FEW else table.sum(1)
     if distinct == index:
         return sums
     if index == tuple(row for row in distinct for _ in range(len(index) // len(distinct))):
@@ -255,13 +257,24 @@ def normalise(a: Array, fallback: Array | None = None) -> Array:
 
 
 def solve_regular(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), no derivative."""
+    """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), no derivative.
+
+    Zeros where a matrix is singular.
+    """
     matrix, right = lax.stop_gradient((matrix, right))
-    if len(matrix) <= LARGE:
+    if len(matrix) <= SMALL:
         return _gauss_jordan(matrix, right)
-    q, r = lax.linalg.qr(jnp.moveaxis(matrix, (0, 1), (-2, -1)))
-    turned = jnp.swapaxes(q, -2, -1) @ jnp.moveaxis(right, (0, 1), (-2, -1))
-    return jnp.moveaxis(lax.linalg.triangular_solve(r, turned, left_side=True), (-2, -1), (0, 1))
+    # What elimination makes of the right side beside the matrix needs no permutation.
+    system = jnp.moveaxis(jnp.concatenate([matrix, right], axis=1), (0, 1), (-2, -1))
+    upper, reduced = jnp.split(lax.linalg.lu(system)[0], [len(matrix)], axis=-1)
+    x = lax.linalg.triangular_solve(upper, reduced, left_side=True)
+    return jnp.moveaxis(jnp.where(jnp.isfinite(x), x, 0.0), (-2, -1), (0, 1))
+
+
+def times(matrix: Array, u: Array) -> Array:
+    """(R, R, *batch) times (R, *batch)."""
+    parts = matrix * u[None]
+    return fold(jnp.add, parts, 1) if len(u) <= MANY else parts.sum(1)
 
 
 def identity(like: Array) -> Array:

@@ -116,21 +116,23 @@ def on_grid(heights, x, v, e, mu, t):
     return jax.tree.map(lambda leaf: leaf[-1], dr.rollout(world, state, dt=1 / 60, times=times, substeps=(60,)).state)
 
 
-@functools.cache
-def compiled(name):
-    """The same program for all tests."""
-    if name == "path":
-        return jax.jit(on_grid)
-    return jax.jit(jax.jacfwd(lambda *args: on_grid(*args).x[0], (0, 1, 3, 5)))
+@jax.jit
+def slopes_and_state(*args):
+    """The same program for all tests: slopes of where it is, by the heights, the start, the restitution and the time."""
 
+    def twice(*args):
+        state = on_grid(*args)
+        return state.x[0], state
 
-def ball_after(heights, x, v, e=0.0, mu=0.0, t=1.0):
-    return compiled("path")(*(jnp.asarray(value, float) for value in (heights, x, v, e, mu, t)))
+    return jax.jacfwd(twice, (0, 1, 3, 5), has_aux=True)(*args)
 
 
 def slopes_after(heights, x, v, e=0.0, mu=0.0, t=1.0):
-    """Of where it is, by the heights, the start, the restitution and the time."""
-    return compiled("slopes")(*(jnp.asarray(value, float) for value in (heights, x, v, e, mu, t)))
+    return slopes_and_state(*(jnp.asarray(value, float) for value in (heights, x, v, e, mu, t)))
+
+
+def ball_after(*args, **options):
+    return slopes_after(*args, **options)[1]
 
 
 def plane(slope, base):
@@ -151,8 +153,8 @@ def test_a_ball_bounces_off_a_tilted_plane():
     """Place and its slopes by the plane, the start, the restitution and the time, in closed form."""
     slope, base, x, v = vector(0.3, -0.2), jnp.asarray(0.4), vector(1.1, 1.8, 1.4), vector(0.4, -0.3, 0.2)
     e, t = jnp.asarray(0.7), jnp.asarray(0.7)
-    assert_allclose(ball_after(plane(slope, base), x, v, e, 0.0, t).x[0], bounced(slope, base, x, v, e, t), atol=EXACT)
-    by_height, *got = slopes_after(plane(slope, base), x, v, e, 0.0, t)
+    (by_height, *got), end = slopes_after(plane(slope, base), x, v, e, 0.0, t)
+    assert_allclose(end.x[0], bounced(slope, base, x, v, e, t), atol=EXACT)
     by_plane = jax.jacrev(plane, (0, 1))(slope, base)
     by_slope, by_base = (jnp.tensordot(by_height, part, 2) for part in by_plane)
     wanted = jax.jacrev(bounced, (0, 1, 2, 4, 5))(slope, base, x, v, e, t)
@@ -163,7 +165,7 @@ def test_a_ball_bounces_off_a_tilted_plane():
 def test_slopes_by_the_heights_are_those_of_differences():
     """Of a ball that bounces and rolls over bumps, with friction."""
     start = (1.8, 1.6, 0.9), (0.5, 0.4, 0.0), 0.5, 0.3, 0.8
-    by_height = np.asarray(slopes_after(BUMPS, *start)[0])
+    by_height = np.asarray(slopes_after(BUMPS, *start)[0][0])
     assert np.isfinite(by_height).all()
     chosen = np.argsort(np.abs(by_height).max(0).ravel())[-6:]
     for k in chosen:
@@ -221,7 +223,8 @@ def test_on_a_flat_grid_is_on_a_half_space():
 LINE = np.array([(0.0, 0.5), (0.5, 0.5), (1.0, 0.1), (1.5, 0.0), (2.0, 0.4), (2.5, 0.2), (3.0, 0.2)])
 
 
-@pytest.mark.parametrize("kind", [pytest.param(dr.Sphere, marks=pytest.mark.slow), dr.Box])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [dr.Sphere, dr.Box])
 def test_a_profile_drawn_out_is_its_twin_in_the_plane(kind):
     """A ball, or a box that is wide across, that bounces, slides and turns over the same ground."""
     x, v, w, mass, inertia = (0.7, 1.2), (0.8, -0.5), -3.0, 1.3, 0.02

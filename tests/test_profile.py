@@ -110,7 +110,7 @@ VALLEY = np.array([(-5.0, 2.0), (-0.5, 0.6), (0.0, 0.0), (0.5, 0.6), (0.7, 0.6),
 PEAK = np.array([(-5.0, -2.0), (-0.5, -0.2), (0.0, 0.0), (0.5, -0.2), (0.7, -0.2), (5.0, -2.0)])
 
 
-@pytest.mark.parametrize("shape", [dr.Disc(radius=0.2), dr.Box(half=(0.3, 0.2))])
+@pytest.mark.parametrize("shape", [pytest.param(dr.Disc(radius=0.2), marks=pytest.mark.slow), dr.Box(half=(0.3, 0.2))])
 def test_on_vertices_in_line_in_a_valley_and_on_a_peak(shape):
     """Vertices in line are not felt; a disc rests between two slopes, a box on two points or balanced on one."""
     box = isinstance(shape, dr.Box)
@@ -135,6 +135,7 @@ def planes(points):
     return {str(k): dr.Static(dr.HalfSpace(normal=n[k], offset=n[k] @ points[1])) for k in range(2)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape, points, other",
     [

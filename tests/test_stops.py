@@ -117,6 +117,7 @@ def test_a_slider_between_elastic_stops_keeps_its_energy():
     assert_allclose(path.x[:, 0, 0], 0.5 - np.abs(way % 1.0 - 0.5) - 0.2, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_stiff_hinge_carries_a_load_that_stands_on_it():
     """Contact and the friction of a joint act on one body: the shelf holds below friction = m g r, else it turns."""
 

@@ -31,7 +31,7 @@ from diffrigid.contact.sides import (
 )
 from diffrigid.numerics import (
     FOUND,
-    LARGE,
+    MANY,
     apart,
     dot,
     fold,
@@ -317,7 +317,7 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array
 
 def _least(times: Array) -> Array:
     """Of the contacts (K, *batch). Written out only where they are few: the program is not to grow with a grid."""
-    return fold(jnp.minimum, times, 0) if len(times) <= LARGE else times.min(0)
+    return fold(jnp.minimum, times, 0) if len(times) <= MANY else times.min(0)
 
 
 def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.contact.cone import put
-from diffrigid.contact.sides import at_colliders, between_bodies, side_sum
+from diffrigid.contact.sides import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
 from diffrigid.linkage import Linkage, spread
-from diffrigid.numerics import LARGE, dot, fold, identity, rows, unit_vector
+from diffrigid.numerics import dot, identity, sum_rows, times, unit_vector
 from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import rotations
 
@@ -93,15 +93,9 @@ def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, 
     apply = rotations(dp.shape[1]).apply
     if mobility.matrix is None:
         return mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL), dL
-    twist = _times(mobility.matrix, jnp.concatenate([dp, dL], axis=1).reshape(-1, *dp.shape[2:]))
+    twist = times(mobility.matrix, jnp.concatenate([dp, dL], axis=1).reshape(-1, *dp.shape[2:]))
     dv, dw = jnp.split(twist.reshape(len(dp), -1, *dp.shape[2:]), [dp.shape[1]], axis=1)
     return dv, dw, jax.vmap(apply)(mobility.inertia, dw)
-
-
-def _times(matrix: Array, u: Array) -> Array:
-    """(R, R, *batch) times (R, *batch)."""
-    parts = matrix * u[None]
-    return fold(jnp.add, parts, 1) if len(u) <= LARGE else parts.sum(1)
 
 
 def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
@@ -198,10 +192,10 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     own = side_sum(block(J_a, back_a), block(J_b, back_b), arms.a, arms.b, moving)
     diagonal = jnp.eye(moving, dtype=own.dtype).reshape(moving, moving, *[1] * (own.ndim - 1))
     whole = diagonal * own[:, None]
-    between = between_bodies(arms.a, arms.b, moving)
+    between = between_bodies(*pairs_of(arms.a, arms.b), moving)
     if between is not None:
-        across = -jnp.concatenate([block(J_a, back_b), block(J_b, back_a), jnp.zeros_like(own[:1])])
-        whole = whole + rows(across, between).sum(1).reshape(moving, moving, size, size, *batch)
+        across = [pair_sum(values, arms.a, arms.b) for values in (block(J_a, back_b), block(J_b, back_a))]
+        whole = whole - sum_rows(jnp.concatenate(across), between).reshape(whole.shape)
     columns = jnp.moveaxis(whole, (1, 3), (0, 1)).reshape(moving * size, moving, size, *batch)
 
     matrix = jax.vmap(lambda column: _twists(mobility, column[:, :D], column[:, D:]), out_axes=1)(columns)

@@ -1,17 +1,19 @@
 """The two colliders of a pair on their paths, and sums over the pairs that each body is in."""
 
 import functools
+import itertools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.distance import reach
 from diffrigid.collide.heights import candidates
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
-from diffrigid.numerics import apart, dot, norm, rows, sum_rows
+from diffrigid.numerics import apart, dot, fold, norm, rows, sum_rows
 from diffrigid.pytree import array, pytree
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
@@ -155,7 +157,31 @@ def reach_of(side: Side) -> Array:
 
 def side_sum(values_a: Array, values_b: Array, a: tuple[int, ...], b: tuple[int, ...], moving: int) -> Array:
     """Sum of per-contact values over the contacts of each moving body, (N, ...)."""
-    return sum_rows(jnp.concatenate([values_a, values_b]), body_sides(a, b, moving))
+    values = jnp.concatenate([pair_sum(values_a, a, b), pair_sum(values_b, a, b)])
+    return sum_rows(values, body_sides(*pairs_of(a, b), moving))
+
+
+def pair_sum(values: Array, a: tuple[int, ...], b: tuple[int, ...]) -> Array:
+    """Sum of per-contact values over the contacts of each pair that are side by side, (P, ...); see `pairs_of`."""
+    parts, start = [], 0
+    for length, pairs in itertools.groupby(_runs(a, b)):
+        count = len(list(pairs))
+        part = values[start : start + count * length].reshape(count, length, *values.shape[1:])
+        parts.append(fold(jnp.add, part, 1))
+        start += count * length
+    return jnp.concatenate(parts)
+
+
+def pairs_of(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Colliders a and b of each run of contacts between the same two."""
+    ends = np.cumsum(_runs(a, b)) - 1
+    return tuple(a[i] for i in ends), tuple(b[i] for i in ends)
+
+
+@functools.cache
+def _runs(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
+    """Lengths of the runs of contacts between the same two colliders."""
+    return tuple(len(list(run)) for _, run in itertools.groupby(zip(a, b, strict=True)))
 
 
 @functools.cache

@@ -31,11 +31,12 @@ from jax.ad_checkpoint import checkpoint_name
 from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
-from diffrigid.numerics import FOUND, dot, identity, norm, safe_divide, solve_regular, some
+from diffrigid.numerics import FOUND, dot, identity, norm, safe_divide, solve_regular, some, times
 from diffrigid.pytree import array, pytree, replace
 
 ROUNDS = 40  # at most, of Newton's method
-CIRCLES = 10  # rounds after which `solve_roughly` gives it another start
+CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
+ROUGH = 1e-2  # with this relative error, and then with as little as it can
 PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
 SMOOTHING = 3  # rounds after each Newton step
 PATIENCE = 3  # rounds that do not lessen a small error: then it is rounding
@@ -155,12 +156,14 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
     takes a share of the masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
     """
     rounding = jnp.finfo(v_rel.dtype).eps
-    tolerance, least = 16.0 * rounding, rounding**0.6 * cone.rest_speed
+    tolerance, stuck, least = 16.0 * rounding, 3.0 * rounding**0.5, rounding**0.6 * cone.rest_speed
+
+    def lacks(best, error, since):
+        small = jnp.where(since < PATIENCE, tolerance, jnp.where(since < 5 * PATIENCE, stuck, jnp.inf))
+        return error > small * speed(best) + least
 
     def busy(carry):
-        count, *_, best, error, since = carry
-        small = jnp.where(since < PATIENCE, tolerance, jnp.where(since < 5 * PATIENCE, 1e-3, jnp.inf))
-        return (count < ROUNDS) & some(error > small * speed(best) + least)
+        return (carry[0] < ROUNDS) & some(lacks(*carry[4:]))
 
     def speed(P):
         return jnp.max(cone.scale[:, None] * jnp.abs(P), (0, 1))
@@ -173,11 +176,15 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         z = _excess(cone, P, v_rel, arms, mobility)
         return z, allowed(cone, z) - P
 
-    def roughly(P, since):
+    def roughly(count, P, since, best, error):
+        del P
+
         def wrong(P):
             return speed(lacking(P)[1])
 
-        return solve_roughly(cone, v_rel, arms, mobility, wrong, least), jnp.zeros_like(since)
+        share = jnp.where(count > CIRCLES, 0.0, ROUGH).astype(v_rel.dtype)
+        enough = jnp.where(lacks(best, error, since), share * speed(best) + least, jnp.inf)
+        return solve_roughly(cone, v_rel, arms, mobility, wrong, enough), jnp.zeros_like(since)
 
     def again(carry):
         count, P, z, r, best, error, since = carry
@@ -186,7 +193,8 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         dP = _newton_step(r, lambda u: solve_regular(matrix, u[:, None])[:, 0], slope, cone, arms, mobility)
         P = lax.fori_loop(0, SMOOTHING, smoother, allowed(cone, P + dP))
         if mobility.inverse_mass.shape[0] >= PILE:
-            P, since = lax.cond(count == CIRCLES, roughly, lambda P, since: (P, since), P, since)
+            again_now = (count > 0) & (count % CIRCLES == 0)
+            P, since = lax.cond(again_now, roughly, lambda _, *kept: kept[:2], count, P, since, best, error)
         z, r = lacking(P)
         size = speed(r)
         better = size < error
@@ -223,7 +231,7 @@ def _solve_together_jvp(primals, tangents):
         inverse = solve_regular(matrix, identity(matrix))
 
         def step(r):
-            return _newton_step(r, lambda u: (inverse * u[None]).sum(1), *fixed)
+            return _newton_step(r, functools.partial(times, inverse), *fixed)
 
         approximate = (lambda r: jax.linear_transpose(step, b)(r)[0]) if transposed else step
         return lax.fori_loop(0, REFINEMENTS, lambda _, x: x + approximate(b - matvec(x)), jnp.zeros_like(b))
