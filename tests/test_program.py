@@ -42,8 +42,8 @@ def size(scene, *args, steps=STEPS):
 
 
 def test_programs_do_not_grow_unnoticed():
-    assert size(discs, 4) < MARGIN * 50200
-    assert size(cube) < MARGIN * 77200
+    assert size(discs, 4) < MARGIN * 55500
+    assert size(cube) < MARGIN * 83900
 
 
 def test_programs_do_not_grow_with_bodies_and_steps():

@@ -84,7 +84,7 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
     after = [v_i + gamma * k_in for v_i, (k_in, *_) in zip([v_n, *v_t], k, strict=True)]
     Q = _friction_impulse(k, gamma, after[1:], mu)
     gained = sum(Q[i] * k[i][j] * Q[j] for i in axes for j in axes)
-    kappa = _within_energy(0.5 * gamma * (v_n + target), sum(Q[i] * after[i] for i in axes), gained)
+    kappa = within_energy(0.5 * gamma * (v_n + target), sum(Q[i] * after[i] for i in axes), gained)
     P = [gamma + kappa * Q[0], *(kappa * Q_t for Q_t in Q[1:])]
     return sum(P[i][None] * basis[i] for i in axes)
 
@@ -141,7 +141,7 @@ def sticking_impulse(K: Array, n: Array, slip: Array) -> Array:
     return sum(P[i][None] * basis[i] for i in axes)
 
 
-def _within_energy(T0: Array, b: Array, c: Array) -> Array:
+def within_energy(T0: Array, b: Array, c: Array) -> Array:
     """Largest kappa <= 1 for which the kinetic energy does not rise: T0 + b kappa + c kappa^2 / 2 <= 0."""
     gains = (T0 + b + 0.5 * c > 0) & (c > 0)
     root = (safe_sqrt(b * b - 2.0 * c * jnp.minimum(T0, 0.0)) - b) / jnp.where(gains, c, 1.0)

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.cone import Cone
+from diffrigid.contact.gain import solve_without_gain
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sides import at_colliders
-from diffrigid.contact.together import solve_together
 from diffrigid.numerics import safe_sqrt, some
 from diffrigid.pytree import array, pytree, static
 
@@ -66,7 +66,7 @@ def solve_impulses(
     arms = Arms(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, jac=strikes.jac, spin=strikes.spin, a=strikes.a, b=strikes.b
     )  # fmt: skip
-    return alone + solve_together(some(shared), cone, strikes.v_rel, arms, mobility)
+    return alone + solve_without_gain(cone, strikes.v_rel, arms, mobility)
 
 
 def are_alone(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> bool:

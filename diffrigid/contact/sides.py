@@ -178,6 +178,11 @@ def pairs_of(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[tuple[int, ...], t
     return tuple(a[i] for i in ends), tuple(b[i] for i in ends)
 
 
+def at_pairs(values: Array, a: tuple[int, ...], b: tuple[int, ...]) -> Array:
+    """Values of the pairs (P, ...) at each of their contacts, (C, ...)."""
+    return rows(values, tuple(pair for pair, length in enumerate(_runs(a, b)) for _ in range(length)))
+
+
 @functools.cache
 def _runs(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
     """Lengths of the runs of contacts between the same two colliders."""

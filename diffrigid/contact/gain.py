@@ -1,0 +1,83 @@
+"""Impacts at several contacts at once, which Newton's law with Coulomb's would let gain energy.
+
+As for one contact (`impulse.py`), P is then taken between the impulses of both laws and P0, those without friction,
+which never gain any:
+
+    P = P0 + kappa Q,   Q = P_both - P0,   T = P . (v_rel + W P / 2) <= 0,   the largest such kappa <= 1
+
+Normal velocities are those of Newton's law on the whole way, and the cone of friction is convex. Contacts that hang
+together through bodies share their kappa.
+Source: Kane & Levinson, Dynamics: Theory and Applications (1985), for the gain.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.contact.cone import Cone
+from diffrigid.contact.impulse import within_energy
+from diffrigid.contact.mobility import Arms, Mobility, moved
+from diffrigid.contact.sides import at_colliders, at_pairs, body_sides, pair_sum, pairs_of
+from diffrigid.contact.together import solve_together
+from diffrigid.numerics import dot, rows, some
+from diffrigid.pytree import replace
+
+
+def solve_without_gain(cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
+    """Impulses of contacts that share bodies, (C, D, *batch) [N s]; arguments as of `solve_together`."""
+    bounces = jnp.where(cone.target > 0, cone.on, 0.0)
+    if cone.most is not None:
+        bounces = jnp.where(jnp.isinf(cone.most), bounces, 0.0)
+    any_bounce = some(bounces > 0)
+
+    def gaining(P: Array) -> Array:
+        P, v = lax.stop_gradient((P, v_rel))
+        T = jax.vmap(dot)(P, v + 0.5 * lax.stop_gradient(moved(P, arms, mobility)))
+        least = jnp.finfo(v.dtype).eps ** 0.6 * jnp.abs(P * v).sum((0, 1))
+        over, struck = _summed(cone, arms, mobility, T, lax.stop_gradient(bounces))
+        return some((over > least[None]) & (struck > 0))
+
+    def one(needed: Array, rough: Array) -> tuple[Array, tuple[Array, Array]]:
+        spin = None if cone.spin is None else rough * cone.spin
+        P = solve_together(needed, replace(cone, mu=rough * cone.mu, spin=spin), v_rel, arms, mobility)
+        gains = lax.cond(any_bounce & (rough > 0), gaining, lambda _: jnp.asarray(False), P)
+        return gains, (P, gains)
+
+    def between(P: Array, P0: Array) -> Array:
+        both = jnp.stack([P0, P - P0])
+        by_both = jax.vmap(lambda P: moved(P, arms, mobility))(both)
+        factors = jnp.stack([v_rel + 0.5 * by_both[0], v_rel + by_both[0], by_both[1]], axis=1)
+        terms = jnp.stack([P0, P - P0, P - P0], axis=1)
+        T0, b, c, struck = _summed(cone, arms, mobility, *jnp.moveaxis((terms * factors).sum(2), 1, 0), bounces)
+        kappa = jnp.where(struck > 0, within_energy(T0, b, c), 1.0)
+        return P0 + kappa[:, None] * both[1]
+
+    # Both solutions in one loop, so that the method is compiled once.
+    _, ((P, P0), (gains, _)) = lax.scan(one, some(cone.on > 0), jnp.array([1.0, 0.0], v_rel.dtype))
+    return lax.cond(gains, between, lambda P, _: P, P, P0)
+
+
+def _summed(cone: Cone, arms: Arms, mobility: Mobility, *values: Array) -> list[Array]:
+    """Sums of values (C, *batch) over all contacts that hang together with each of them, each (C, *batch)."""
+    moving, (a, b) = mobility.inverse_mass.shape[0], pairs_of(arms.a, arms.b)
+    by_pair = pair_sum(jnp.stack([cone.on, *values], axis=1), arms.a, arms.b)
+    number = lax.broadcasted_iota(by_pair.dtype, (moving, *by_pair.shape[2:]), 0)
+    none = jnp.full_like(number[:1], moving)
+
+    def of_pairs(label: Array) -> Array:
+        least = jnp.minimum(at_colliders(label, a, moving), at_colliders(label, b, moving))
+        return jnp.where(by_pair[:, 0] > 0, least, moving)
+
+    def spread(_: int, label: Array) -> Array:
+        least = of_pairs(label)
+        touching = rows(jnp.concatenate([least, least, none]), body_sides(a, b, moving))
+        return jnp.minimum(label, touching.min(1))
+
+    if mobility.matrix is None:
+        label = of_pairs(lax.fori_loop(0, moving - 1, spread, number))
+    else:  # joints may hold all of them together
+        label = jnp.zeros_like(by_pair[:, 0])
+    member = (label[None] == number[:, None]).astype(by_pair.dtype)
+    sums = (member[:, :, None] * by_pair[None]).sum(1)
+    each = at_pairs((member[:, :, None] * sums[:, None]).sum(0), arms.a, arms.b)
+    return [each[:, k] for k in range(1, each.shape[1])]
