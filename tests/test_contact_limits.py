@@ -256,6 +256,7 @@ def test_friction_of_rounding_has_finite_slopes():
     assert all(np.isfinite(slope).all() for slope in back(jnp.ones_like(lost)))
 
 
+@pytest.mark.slow
 def test_slopes_after_an_impact_at_the_very_end_of_a_step():
     """In float32 and with drag, what is left of the step after the impact is too short for its third power."""
     dt = 1 / 240

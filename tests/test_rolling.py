@@ -110,6 +110,7 @@ def check_ways(dim, values, slopes):
         assert_allclose(slope[seen], true_slope[seen], atol=EXACT, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_disc_on_a_plane():
     """A batch of cases, and slopes by both frictions, speed, slope and time, in reverse mode."""
     check_ways(2, *motions(2, jax.jacrev, [row for _, row in CASES.values()]))
