@@ -24,7 +24,10 @@ from diffrigid.pytree import replace
 
 
 def solve_without_gain(cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
-    """Impulses of contacts that share bodies, (C, D, *batch) [N s]; arguments as of `solve_together`."""
+    """Impulses of contacts that share bodies, (C, D, *batch) [N s]; arguments as of `solve_together`.
+
+    Differentiable as these are, but where the bound on energy begins to act.
+    """
     bounces = jnp.where(cone.target > 0, cone.on, 0.0)
     if cone.most is not None:
         bounces = jnp.where(jnp.isinf(cone.most), bounces, 0.0)
