@@ -87,6 +87,35 @@ def test_cradle_of_touching_balls():
     assert_allclose(end.x[-1, :, 0], [0.0, 1.0, 2.0, 3.0, 6.0, -1.0], atol=1e-8)
 
 
+def test_a_block_slides_into_another():
+    """Both rub on the floor until they meet within a step, and from then on: places and slopes of closed form."""
+    sliding, steps = 0.75, 45
+
+    def at_end(p):
+        side, box = 0.2, dr.Box(half=(0.1, 0.1))
+        bodies = {
+            "block": dr.Body(box, mass=1.0, x=(0.0, 0.1), v=jnp.stack([p["v"], 0.0 * p["v"]])),
+            "other": dr.Body(box, mass=p["m"], x=jnp.stack([side + p["way"], 0.1 + 0.0 * p["v"]])),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)), restitution=0.0),
+        }
+        world, state = dr.scene(bodies, gravity=(0.0, -G), friction=p["mu"], restitution=p["e"])
+        return dr.rollout(world, state, dt=sliding / steps, steps=steps).state.x[-1, :, 0]
+
+    def expected(p):
+        brake = p["mu"] * G
+        v = jnp.sqrt(p["v"] ** 2 - 2 * brake * p["way"])
+        after = v / (1 + p["m"]) * jnp.stack([1 - p["e"] * p["m"], 1 + p["e"]])
+        return p["way"] + jnp.array([0.0, 0.2]) + after * jnp.abs(after) / (2 * brake)
+
+    p = {"v": 1.6, "m": 0.5, "way": 0.13, "mu": 0.3, "e": 0.6}
+    p = jax.tree.map(jnp.asarray, p)
+    assert_allclose(jax.jit(at_end)(p), expected(p), atol=1e-7)
+    for slopes, true_slopes in zip(
+        *(jax.tree.leaves(jax.jacfwd(f)(p)) for f in (jax.jit(at_end), expected)), strict=True
+    ):
+        assert_allclose(slopes, true_slopes, atol=1e-4)  # both stop within a step
+
+
 def test_a_ball_that_rests_is_struck():
     """From above and aside, so that it hits the floor at once: slopes by aim, speed and law are those of differences."""
 

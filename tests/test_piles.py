@@ -36,6 +36,21 @@ def test_a_pile_stands(pile):
     assert energy < STANDS**2
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_stack_takes_a_fall(dtype):
+    """Boxes fall apart from each other and land one on the other, without rebound: each stops where it lands."""
+    box, count = dr.Box(half=(0.25, 0.25)), 6
+    bodies = {f"{i}": dr.Body(box, mass=1.0, x=(0.1 * (i % 3 - 1), 0.25 + 0.6 * i)) for i in range(count)}
+    scene = dr.scene(bodies | FLOOR, gravity=(0.0, -G), friction=0.5)
+    world, state = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), scene)
+    end = dr.rollout(world, state, dt=1 / 240, steps=130).state
+    speed = max(float(jnp.abs(leaf[-1]).max()) for leaf in (end.v, end.w))
+    rounding = float(jnp.finfo(dtype).eps) ** 0.5
+    places = np.stack([state.x[:, 0], 0.25 + 0.5 * np.arange(count)], axis=1)
+    np.testing.assert_allclose(end.x[-1], places, atol=3 * rounding)
+    assert speed < 30 * rounding
+
+
 def test_a_house_of_cards_stands():
     """Two cards lean on each other; friction of their feet and of the ridge keeps them up."""
     half, lean = (0.5, 0.02), np.radians(70.0)

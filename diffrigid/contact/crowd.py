@@ -23,7 +23,7 @@ from diffrigid.contact.grid import Near, neighbours, pick
 from diffrigid.contact.impact import approach
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.sides import Side
-from diffrigid.contact.strikes import Material, law, materials, strikes_of
+from diffrigid.contact.strikes import Material, law, materials, next_strikes
 from diffrigid.flight import launch, orientation, state_at
 from diffrigid.numerics import FOUND, dot, norm, rows, some
 from diffrigid.pytree import map_arrays, pytree, replace
@@ -261,7 +261,7 @@ def _meet(crowd: Crowd, walls: list[Walls], following: Next, bodies: Side, ancho
 def _blow(crowd: Crowd, a: Array, side_a: Side, own: list, side_b: Side, others: list, there: Array) -> tuple:
     """Whether there is an impact, its time [s], impulse on a (D, E) [N s], and arms (D, E) [m]."""
     world, dt = _at((crowd.world, crowd.dt), a)
-    strike = strikes_of(world, side_a, side_b, jnp.broadcast_to(dt, a.shape), jnp.asarray(False), None)
+    strike = next_strikes(world, side_a, side_b, jnp.broadcast_to(dt, a.shape))
     on = strike.active & there[None]
     own, others = jax.tree.map(lambda leaf: leaf[None], (own, others))
     e, mu = law(own, others, strike)

@@ -18,6 +18,7 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.collide.heights import height_over, unseen_for
+from diffrigid.contact.order import Meeting
 from diffrigid.contact.sides import (
     Placed,
     Side,
@@ -37,6 +38,7 @@ from diffrigid.numerics import (
     fold,
     implicit_root,
     norm,
+    normalise,
     opaque_true,
     safe_divide,
     safe_sqrt,
@@ -49,12 +51,13 @@ from diffrigid.state import rotations
 CROSSED = 3  # advances for each node along a side of a grid: the length of its diagonal in half cells
 ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
 POLISH = 6  # steps along the local parabola of the gap; error squared by each
+ROUNDING = 1e5  # [-] of the last digit of NEAR: how far rounding of their places may hold bodies apart
 NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over to polishing
 
 
 def find_impact(
     a: Side, b: Side, t1: Array, width: Array | None, straight: bool, rest_speed: Array, at_end: Array
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> Meeting:
     """First impact of one pair before t1, or the end of the step itself.
 
     Args:
@@ -64,19 +67,13 @@ def find_impact(
         rest_speed: (*batch) [m/s] slower impacts do not move their time with the parameters.
         at_end: bool; True: do not look for an impact, s is t1.
 
-    Returns:
-        s (*batch) [s]; hit (*batch) bool, it happens before t1; level (*batch) [m] of the gap at which it
-        happens; slack (*batch) [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size;
-        rests (*batch) bool, some contact rests from the start: it is no impact, nor does it hide that of another.
-        False where `at_end`.
-
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
     """
-    live = opaque_true(t1)
+    live, begin = opaque_true(t1), _earliest(a, b)[0]
     varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
     if closed_form(a.shape, b.shape, straight) and not varying:
         s0, level, found, _ = apart(live, approach, a, b, width)
-        rests = jnp.zeros_like(found)
+        rests = _round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
     else:
         s0, level, found, rests = _approach_search(a, b, t1, width, rest_speed, at_end)
     hit = found & (s0 <= t1) & ~at_end
@@ -90,11 +87,30 @@ def find_impact(
     share = closing.astype(s0.dtype) / jnp.maximum(closing.sum(0), 1)[None].astype(s0.dtype)
     s = implicit_root(s0, (share * moved.gap).sum(0) - level, (share * speed).sum(0))
     # What is already inside where the paths begin is struck there, whatever its gap.
-    begin = _earliest(a, b)[0]
     at_once = jnp.any(closing & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
     s = jnp.where(at_once, begin, s)
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
-    return s, hit | at_end, level, slack, rests
+    # Which of the many places of a grid rest is not what the contacts are numbered by.
+    rests = rests if len(rests) == len(gap) else jnp.broadcast_to(rests.any(0), gap.shape)
+    return Meeting(s=s, hit=hit | at_end, fast=closing.any(0), rests=rests & ~at_end, level=level, slack=slack)
+
+
+def _round_rests(a: Side, b: Side, start: Array, rest_speed: Array) -> Array:
+    """Whether two round shapes, or one and a half-space, touch at the start and stay together, (*batch) bool."""
+    (x_a, v_a), (x_b, v_b) = centre(a, start), centre(b, start)
+    if isinstance(b.shape, HalfSpace):
+        n = rotations(a.flight.dim).rotate(b.q, b.shape.normal)
+        gap, acc = dot(n, x_a - x_b) - b.shape.offset - a.shape.radius, dot(n, a.flight.a)
+    else:
+        n = normalise(x_a - x_b)
+        gap, acc = norm(x_a - x_b) - a.shape.radius - b.shape.radius, jnp.zeros_like(start)
+    return _touches(gap, dot(n, v_a - v_b), acc, NEAR * jnp.minimum(reach_of(a), reach_of(b)), rest_speed)
+
+
+def _touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array:
+    """Whether a gap is closed, or about to close, no faster than `slow` [m/s]; rounding does not keep it open."""
+    open_by = jnp.maximum(gap - ROUNDING * jnp.finfo(gap.dtype).eps * near, 0.0)
+    return (gap <= near) & (v * v + 2.0 * open_by * jnp.abs(acc) <= slow**2)
 
 
 def approach(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:
@@ -214,7 +230,7 @@ def _approach_search(
 
     level = _if_smooth(width, smooth, jnp.zeros_like, near)
     s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, start, t1, rests, at_end, live)
-    return jnp.where(s < bound, start, s), level, found, rests.any(0)
+    return jnp.where(s < bound, start, s), level, found, rests
 
 
 def _motion(a: Side, b: Side, s: Array, live: Array) -> tuple[Array, Array, Array, Array | None]:
@@ -302,11 +318,10 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array
         count, s, dt, rests = carry
         onward = jnp.where(s < t1, jnp.minimum(s + jnp.maximum(dt, 0.0), t1), s)
         gap, v, acc, normal = _motion(a, b, onward, live)
-        square = v * v + 2.0 * jnp.maximum(gap, 0.0) * jnp.abs(acc)  # of the speed at which it touches
-        touches = (gap <= near[None]) & (square <= slow[None] ** 2)
+        touches = _touches(gap, v, acc, near[None], slow[None])
         # Beside one that rests, what closes by a third of its fall: it would be back within the step, whatever e <= 1.
         least = slow[None] + jnp.maximum(-acc, 0.0) * span[None] / 3.0
-        beside = (gap <= near[None]) & (square <= least**2) & touches.any(0)[None]
+        beside = _touches(gap, v, acc, near[None], least) & touches.any(0)[None]
         rests = jnp.where(count == 0, touches | beside, rests)
         return count + 1, onward, safe_time(gap, v, acc, normal, rests, onward), rests
 

@@ -28,18 +28,20 @@ from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
+from diffrigid.contact.order import over_islands
 from diffrigid.contact.resting import Strikes, solve_impulses
 from diffrigid.contact.rolling import rolling_stops, with_rows
-from diffrigid.contact.sides import at_colliders, body_sides, side_sum
+from diffrigid.contact.sides import at_colliders, side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
-from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, is_rolling, may_meet
+from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, is_rolling, may_meet, waits
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.linkage import Linkage, islands, linkage, spread
-from diffrigid.numerics import FOUND, constant, dot, rows, safe_divide, some, with_tangents
+from diffrigid.numerics import FOUND, constant, dot, safe_divide, some, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
 IMPACT, HOLD, PUSH = 0, 1, 2
+HOLDS = 2  # passes until the first impact of what rests: one to where it would be in free fall, one from there
 
 
 @pytree
@@ -124,13 +126,14 @@ class Contact:
             some_pass = isolated_or_any if tables else one_pass
             return lax.cond(needed, lambda c: some_pass(*c, phase), lambda c: c, carry), None
 
-        phases = jnp.array([IMPACT] * self.sweeps + [HOLD, PUSH])
+        impacts = self.sweeps + HOLDS * waits(world)
+        phases = jnp.array([IMPACT] * impacts + [HOLD, PUSH])
         (end, *_), _ = lax.scan(maybe, (start, resting, near, jnp.asarray(any(always))), phases)
         return end
 
 
 def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Array, phase: Array):
-    """One pass: the anchors after it, the contacts that rest, whether there was an impact, whether any rests."""
+    """One pass: the anchors after it, the contacts that rest, whether any acted, whether any rests."""
     impact, push = phase == IMPACT, phase == PUSH
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
@@ -140,30 +143,28 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     if world.bodies.restitution_falloff is not None:
         restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
     slow = u <= world.contact.rest_speed[None]
-    hang_together = islands(world.joints, len(world.names))
-    now = strikes.active & _is_next(strikes, strikes.active & ~slow, hang_together, dt)
     closing = -jax.vmap(dot)(strikes.normal, strikes.pull)
     rests = slow | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
-    found = resting | (strikes.active & (slow | (now & rests)))
     falls = u <= world.contact.rest_speed[None] + 2.0 * jnp.maximum(_fall(flight, dt)[None], closing * dt[None])
-    held = jnp.where(push, resting & ~drives, strikes.active & (resting | falls))
-    now, resting = jnp.where(impact, now, held), jnp.where(impact, found, held)
+    held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | falls)
+    found = resting | held | (strikes.active & ~strikes.held & (slow | (strikes.now & rests)))
+    held = jnp.where(push, resting & ~drives, held)
+    now, resting = held | (strikes.active & strikes.now), jnp.where(impact, found, held)
     began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
-    held_for = jnp.where(impact | push, 0.0, dt[None] - began)
+    held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
     # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
     may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(strikes.gap, 0.0), held_for), 0.0)
-    at_rest = jnp.where(impact | push | (strikes.gap <= 0), 0.0, may_close)
-    target, force = driving(world, jnp.where(impact & ~rests, restitution * u, at_rest))
+    at_rest = jnp.where(push | (strikes.gap <= 0), 0.0, may_close)
+    target = jnp.where(held, at_rest, jnp.where(rests, 0.0, restitution * u))
+    target, force = driving(world, target)
     v_rel = jnp.where(push, strikes.gap[:, None] * strikes.normal, strikes.v_rel)
-    strikes = replace(strikes, active=now, v_rel=v_rel)
+    strikes = replace(strikes, active=now, held=held, v_rel=v_rel)
 
     def strike(anchors):
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
-        evenly = 0.5 * (dt[None] - anchors.t0)
-        lever = jnp.where(impact, 0.0, jnp.where(push, 1.0, evenly))
         most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
         mu = jnp.where(push, 0.0, friction)
-        return _apply(world, anchors, flight, strikes, (target, mu, most), kick, lever, held_for)
+        return _apply(world, anchors, flight, strikes, (target, mu, most), kick, held_for)
 
     any_now = some(now)
     return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, some(resting | strikes.rests)
@@ -179,31 +180,6 @@ def _fall(flight: Flight, dt: Array) -> Array:
     return dt * jnp.sqrt((flight.a**2).sum(1).max(0))
 
 
-def _is_next(strikes: Strikes, fast: Array, islands: tuple[tuple[int, ...], ...], dt: Array) -> Array:
-    """Contacts at the time of the first fast impact of both their bodies; ties within rounding act together.
-
-    An impact reaches all bodies that hang together by joints.
-    """
-    s = lax.stop_gradient(strikes.s)
-    tie = jnp.sqrt(jnp.finfo(s.dtype).eps) * dt[None]
-    times = jnp.where(fast, s, jnp.inf)
-    padded = jnp.concatenate([times, times, jnp.full_like(times[:1], jnp.inf)])
-    first = _over_islands(
-        jnp.min, rows(padded, body_sides(strikes.a, strikes.b, len(islands))).min(1), islands, jnp.inf
-    )
-    earliest = jnp.minimum(at_colliders(first, strikes.a, jnp.inf), at_colliders(first, strikes.b, jnp.inf))
-    return jnp.abs(s - earliest) <= tie
-
-
-def _over_islands(reduce: Callable, values: Array, islands: tuple[tuple[int, ...], ...], none: float) -> Array:
-    """Values of the bodies (N, ...) reduced over those that hang together with each, (N, ...)."""
-    most = max(map(len, islands))
-    if most == 1:
-        return values
-    padded = jnp.concatenate([values, jnp.full_like(values[:1], none)])
-    return reduce(rows(padded, tuple(i + (len(islands),) * (most - len(i)) for i in islands)), axis=1)
-
-
 def _apply(
     world: Any,
     anchors: Anchors,
@@ -211,7 +187,6 @@ def _apply(
     strikes: Strikes,
     law: tuple[Array, Array, Array | None],
     kick: Array,
-    lever: Array,
     held_for: Array,
 ) -> Anchors:
     """Solve for the impulses and anchor every struck body anew at the time of its impact.
@@ -221,14 +196,15 @@ def _apply(
     Args:
         law: target, mu and most of `solve_impulses`.
         kick: 1, or 0 for a displacement that leaves velocities as they are.
-        lever: (N, *batch) [s] displacement per change of velocity.
         held_for: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
     """
-    moving, active = flight.t0.shape[0], strikes.active.astype(kick.dtype)
-    both = jnp.stack([active, active * strikes.s], axis=1)
-    own = side_sum(both, both, strikes.a, strikes.b, moving)
-    count, total = jnp.moveaxis(_over_islands(jnp.sum, own, islands(world.joints, moving), 0.0), 1, 0)
+    moving, active, held = flight.t0.shape[0], strikes.active.astype(kick.dtype), strikes.held.astype(kick.dtype)
+    each = jnp.stack([active, active * strikes.s, held], axis=1)
+    own = side_sum(each, each, strikes.a, strikes.b, moving)
+    count, total, evenly = jnp.moveaxis(over_islands(jnp.sum, own, islands(world.joints, moving), 0.0), 1, 0)
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
+    # Displacement per change of velocity [s]: a force that has acted evenly has its centroid in the middle.
+    lever = jnp.where(kick > 0, jnp.where(evenly > 0, 0.5 * (t - flight.t0), 0.0), 1.0)
     q, mobility, link = _posed(world, flight, t)
     onto = None if link is None else _onto_joints(flight, t, link, (count > 0) & (kick > 0))
     if onto is not None:
@@ -249,7 +225,9 @@ def _apply(
     kicked = kick * dv, kick * dL + kept
     if onto is not None:
         kicked = kicked[0] + onto[0], kicked[1] + onto[2]
-    return _anchored(anchors, flight, t, q, count > 0, kicked, moved)
+    # The path from where a body was held until, followed backwards, is its own but to second order.
+    since = jnp.where(count > 0, jnp.where((kick > 0) & (evenly > 0), flight.t0, t), anchors.since)
+    return _anchored(flight, t, q, since, kicked, moved)
 
 
 def _onto_joints(flight: Flight, t: Array, link: Linkage, hit: Array) -> tuple[Array, Array, Array]:
@@ -273,12 +251,12 @@ def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility, Linka
     return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse), None
 
 
-def _anchored(anchors: Anchors, flight: Flight, t, q, hit, kicked, moved) -> Anchors:
+def _anchored(flight: Flight, t: Array, q: Array, since: Array, kicked: tuple, moved: tuple) -> Anchors:
     """Every body anchored anew at its time t.
 
     Args:
         q: orientations at t.
-        hit: (N, *batch) bool: its path holds from t on only.
+        since: (N, *batch) [s] from when on its new path holds.
         kicked: changes of v (N, D, *batch) [m/s] and L (N, A, *batch) [N m s].
         moved: displacement (N, D, *batch) [m] and turn (N, A, *batch) [rad]; L is kept in the turn.
     """
@@ -289,4 +267,4 @@ def _anchored(anchors: Anchors, flight: Flight, t, q, hit, kicked, moved) -> Anc
         return replace(after, x=after.x + dx)
 
     state = jax.vmap(one)(flight, t, q, *kicked, *moved)
-    return Anchors(state=state, t0=t, since=jnp.where(hit, t, anchors.since))
+    return Anchors(state=state, t0=t, since=since)

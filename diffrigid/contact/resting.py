@@ -27,7 +27,9 @@ class Strikes:
     K: Array = array("C", "D", "D")  # [1/kg] effective matrix
     v_rel: Array = array("C", "D")  # [m/s] of a against b at the contact point, before the impulse
     pull: Array = array("C", "D")  # [m/s^2] acceleration of a against b there
-    rests: Array = array("C")  # bool: a contact of its pair has rested from the start of the path
+    rests: Array = array("C")  # bool: it touches from the start of the path on
+    now: Array = array("C")  # bool: it is the turn of this impact
+    held: Array = array("C")  # bool: s is until when it is held, not an impact
     drift: Array = array("C", "D")  # [m/s] half the velocity of a against b, of the centres; 0 at a static
     a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
     b: tuple[int, ...] = static(default=())

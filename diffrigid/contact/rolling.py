@@ -55,7 +55,7 @@ def with_rows(
     rows = Strikes(
         active=strikes.active[:count], s=strikes.s[:count], gap=zero, normal=along, arm_a=none, arm_b=none,
         K=_mobility_of_turns(mobility, a, b, so), v_rel=kick * turns(w), pull=turns(pull), drift=none,
-        rests=strikes.rests[:count],
+        rests=strikes.rests[:count], now=strikes.now[:count], held=strikes.held[:count],
     )  # fmt: skip
     strikes = replace(
         jax.tree.map(lambda old, new: _behind(count, old, new), replace(strikes, a=(), b=(), jac=None), rows),

@@ -13,7 +13,7 @@ from diffrigid.contact.sides import at_colliders, same_bodies
 from diffrigid.numerics import constant, dot, norm, safe_divide, sum_rows
 from diffrigid.pytree import replace
 
-CREEP = 1e-6  # [m/s] of a slip that is none
+CREEP = 1e-6  # [m/s] of a slip that is none; in single precision the root of rounding is more
 
 
 def keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array:
@@ -66,11 +66,14 @@ def lost_to_stops(strikes: Any, T: Array, slip: Array, at_end: Array, friction: 
     def in_all(values: Array) -> Array:  # over the contacts of the same two bodies, which slip as one
         return sum_rows(values, together)
 
-    speed, at_end_speed, own = (jax.vmap(norm)(r) for r in (slip, at_end, friction))
+    speed, at_end_speed = (jax.vmap(norm)(r) for r in (slip, at_end))
+    # Against the slip: what contacts of the same two bodies do against each other stops nothing.
+    own = -jax.vmap(dot)(friction, at_end / jnp.where(at_end_speed > 0, at_end_speed, 1.0)[:, None])
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
+    creep = max(CREEP, float(jnp.finfo(T.dtype).eps) ** 0.5)
     whole = at_end_speed * bound + size * (speed - along)
-    stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0) & (speed > CREEP)
+    stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0) & (speed > creep)
     least = float(jnp.finfo(T.dtype).tiny) ** 0.5  # the derivative of a quotient divides by the square of this
     stops = stops & (at_end_speed > least) & (whole > least)
     share = safe_divide(speed * size, jnp.where(stops, whole, 0.0))  # tau / T

@@ -17,7 +17,7 @@ from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
-from diffrigid.contact.strikes import law, materials, strikes_of
+from diffrigid.contact.strikes import law, materials, next_strikes
 from diffrigid.flight import Flight, orientation
 from diffrigid.numerics import apart, dot, fold, opaque_true, pack
 from diffrigid.pytree import replace
@@ -63,7 +63,7 @@ def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, 
 
     def blow(unpack_b: Callable, columns_a: list, columns_b: list, there: Array) -> Blow:
         (a, own), (b, others) = unpack(columns_a), unpack_b(columns_b)
-        strike = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, jnp.asarray(False), None))(a, b)
+        strike = jax.vmap(lambda a, b: next_strikes(world, a, b, dt))(a, b)
         strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, pull=None, drift=None))
         return Blow(summed(there) * strike.active.astype(dt.dtype), strike, *law(own, others, strike))
 

@@ -15,6 +15,7 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.constraints import by_twists
+from diffrigid.contact.order import Meeting
 from diffrigid.contact.resting import Strikes
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.joints import Pose
@@ -58,8 +59,8 @@ def of_stops(world: Any, field: str, kinds: tuple[str, ...], other: float, batch
     return jnp.concatenate([jnp.broadcast_to(part, part.shape[:1] + batch) for part in parts])
 
 
-def find_stops(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array) -> Strikes:
-    """Rows of every limit at the time when it is struck, or at the end of the step, and of every friction at the end.
+def meet_stops(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array) -> Meeting:
+    """When every limit is struck, or the end of the step; and every friction, which acts at all times.
 
     Args:
         at_end: bool; True: all at the end of the step.
@@ -67,58 +68,61 @@ def find_stops(world: Any, flight: Flight, since: Array, dt: Array, at_end: Arra
     padded, parts = _with_statics(world, flight), []
     since = jnp.concatenate([since, jnp.broadcast_to(-dt, (len(world.static_names) + 1, *dt.shape))])
     for stop in stops_of(world):
-        group = world.joints[stop.group]
-        sides = (jax.tree.map(lambda leaf, ends=ends: rows(leaf, ends), padded) for ends in (group.a, group.b))
-        latest = jnp.maximum(rows(since, group.a), rows(since, group.b))
-        row: Callable = partial(_row, stop.kind, dt, at_end)
-        parts.append(jax.vmap(row)(replace(group, a=None, b=None), *sides, latest))
+        group, sides = _rows_of(world, stop, padded)
+        latest = jnp.maximum(*(rows(since, ends) for ends in (world.joints[stop.group].a, world.joints[stop.group].b)))
+        struck: Callable = partial(_struck, stop.kind, dt, at_end, world.contact.rest_speed)
+        parts.append(jax.vmap(struck)(group, *sides, latest))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def _row(kind: str, dt: Array, at_end: Array, joint: Any, a: Flight, b: Flight, since: Array) -> Strikes:
+def find_stops(world: Any, flight: Flight, meeting: Meeting) -> Strikes:
+    """The rows of all joints when they are met."""
+    padded, parts, start = _with_statics(world, flight), [], 0
+    for stop in stops_of(world):
+        group, sides = _rows_of(world, stop, padded)
+        own = slice(start, start + len(world.joints[stop.group].a))
+        row: Callable = partial(_row, stop.kind)
+        parts.append(jax.vmap(row)(group, *sides, jax.tree.map(lambda leaf, own=own: leaf[own], meeting)))
+        start = own.stop
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def _rows_of(world: Any, stop: Stop, padded: Flight) -> tuple[Any, list[Flight]]:
+    """The joints of a group, and the flights of their bodies."""
+    group = world.joints[stop.group]
+    sides = [jax.tree.map(lambda leaf, ends=ends: rows(leaf, ends), padded) for ends in (group.a, group.b)]
+    return replace(group, a=None, b=None), sides
+
+
+def _gap(kind: str, joint: Any, a: Flight, b: Flight) -> Callable[[Array], Array]:
     so, sign = rotations(a.dim), -1.0 if kind == "upper" else 1.0
 
     def gap(s: Array) -> Array:
         poses = (Pose(position(f, s), orientation(f, s)) for f in (a, b))
         return sign * (joint.coordinate(so, *poses) - getattr(joint, kind))
 
-    if kind == "friction":
-        s, active = dt, jnp.broadcast_to(at_end, dt.shape)
-    else:
-        s, active = _struck(gap, since, jnp.maximum(a.t0, b.t0), dt, at_end)
-    poses: Any = [Pose(position(f, s), orientation(f, s)) for f in (a, b)]
-    inverses = [so.world_inverse(f.inverse_inertia, pose.q) for f, pose in zip((a, b), poses, strict=True)]
-    spins = [so.apply(i, angular_momentum(f, s)) for i, f in zip(inverses, (a, b), strict=True)]
-    twists = [jnp.concatenate([velocity(f, s), w]) for f, w in zip((a, b), spins, strict=True)]
-    along = sign * by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], *poses)[0]
-    jac = along.reshape(2, so.D + so.A, *dt.shape)
-    rate = (jac * jnp.stack(twists)).sum((0, 1))
-    bend = lax.stop_gradient(_second(gap, s))
-    mobile = [f.inverse_mass * (j[: so.D] ** 2).sum(0) for f, j in zip((a, b), jac, strict=True)]
-    mobile += [(j[so.D :] * so.apply(i, j[so.D :])).sum(0) for i, j in zip(inverses, jac, strict=True)]
-    first = unit_vector(jnp.zeros((so.D, *dt.shape), dt.dtype), 0)
-    none = jnp.zeros_like(first)
-    return Strikes(
-        active=active, s=s, gap=gap(s) if kind != "friction" else jnp.zeros_like(s), normal=first, arm_a=none,
-        arm_b=none, K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,
-        pull=bend[None] * first, drift=none, rests=jnp.zeros_like(active),
-        jac=jac,
-    )  # fmt: skip
+    return gap
 
 
-def _struck(gap: Callable, since: Array, start: Array, dt: Array, at_end: Array) -> tuple[Array, Array]:
-    """When a limit is struck, (*batch) [s], and whether it is, or is touched where `at_end`.
+def _struck(
+    kind: str, dt: Array, at_end: Array, rest_speed: Array, joint: Any, a: Flight, b: Flight, since: Array
+) -> Meeting:
+    """When a limit is struck, or the end of the step.
 
     On a path that goes back to `since`, before the step: so one that was missed there is still taken at its time. One
     that is not open then but is passed at the end is touched at once.
     """
+    if kind == "friction":
+        never = jnp.zeros(dt.shape, bool)
+        return Meeting(s=dt, hit=never | at_end, fast=never, rests=~never[None])
+    gap, start = _gap(kind, joint, a, b), jnp.maximum(a.t0, b.t0)
     slack = jnp.sqrt(jnp.finfo(dt.dtype).eps)
     free = lax.stop_gradient(gap(since)) > slack
     inside = lax.stop_gradient(gap(dt)) < 0
 
     def closer(_, ends):
         low, high, s = ends
-        value, slope = jax.jvp(gap, (s,), (jnp.ones_like(s),))
+        value, slope = _rate(gap, s)
         low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
         newton = s - value / jnp.where(slope != 0, slope, 1.0)
         within = (newton >= low) & (newton <= high) & (slope != 0)
@@ -127,9 +131,40 @@ def _struck(gap: Callable, since: Array, start: Array, dt: Array, at_end: Array)
     found = lax.fori_loop(0, SEARCH, closer, lax.stop_gradient((since, dt, 0.5 * (since + dt))))[2]
     hit = inside & ~at_end
     s0 = checkpoint_name(lax.stop_gradient(jnp.where(hit & free, found, jnp.where(hit, start, dt))), FOUND)
-    value, slope = jax.jvp(gap, (s0,), (jnp.ones_like(s0),))
-    s = jnp.where(hit & free, implicit_root(s0, value, lax.stop_gradient(slope)), jnp.where(hit, start, dt))
-    return s, hit | (at_end & (value <= slack))
+    value, slope = _rate(gap, s0)
+    slope = lax.stop_gradient(slope)
+    s = jnp.where(hit & free, implicit_root(s0, value, slope), jnp.where(hit, start, dt))
+    at_start, closing = lax.stop_gradient(_rate(gap, start))
+    rests = (at_start <= slack) & (jnp.abs(closing) <= rest_speed) & ~at_end
+    return Meeting(s=s, hit=hit | at_end, fast=hit & (slope < -rest_speed), rests=rests[None])
+
+
+def _rate(gap: Callable, s: Array) -> tuple[Array, Array]:
+    """Gap and its rate."""
+    return jax.jvp(gap, (s,), (jnp.ones_like(s),))
+
+
+def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strikes:
+    so, sign, s = rotations(a.dim), -1.0 if kind == "upper" else 1.0, meeting.s
+    poses: Any = [Pose(position(f, s), orientation(f, s)) for f in (a, b)]
+    inverses = [so.world_inverse(f.inverse_inertia, pose.q) for f, pose in zip((a, b), poses, strict=True)]
+    spins = [so.apply(i, angular_momentum(f, s)) for i, f in zip(inverses, (a, b), strict=True)]
+    twists = [jnp.concatenate([velocity(f, s), w]) for f, w in zip((a, b), spins, strict=True)]
+    along = sign * by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], *poses)[0]
+    jac = along.reshape(2, so.D + so.A, *s.shape)
+    rate = (jac * jnp.stack(twists)).sum((0, 1))
+    mobile = [f.inverse_mass * (j[: so.D] ** 2).sum(0) for f, j in zip((a, b), jac, strict=True)]
+    mobile += [(j[so.D :] * so.apply(i, j[so.D :])).sum(0) for i, j in zip(inverses, jac, strict=True)]
+    first = unit_vector(jnp.zeros((so.D, *s.shape), s.dtype), 0)
+    none, gap = jnp.zeros_like(first), _gap(kind, joint, a, b)
+    open_by = jnp.zeros_like(s) if kind == "friction" else gap(s)
+    touches = ~meeting.held | (open_by <= jnp.sqrt(jnp.finfo(s.dtype).eps))
+    return Strikes(
+        active=meeting.hit & touches, s=s, gap=open_by, normal=first, arm_a=none, arm_b=none,
+        K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,
+        pull=lax.stop_gradient(_second(gap, s))[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now,
+        held=meeting.held, jac=jac,
+    )  # fmt: skip
 
 
 def _second(gap: Callable, s: Array) -> Array:

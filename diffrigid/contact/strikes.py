@@ -12,11 +12,13 @@ from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix, restitution_at
-from diffrigid.contact.resting import Strikes
+from diffrigid.contact.order import Meeting, in_order
+from diffrigid.contact.resting import Strikes, are_alone
 from diffrigid.contact.sides import Placed, Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
-from diffrigid.contact.stops import find_stops, is_drive, of_stops, stop_ends, stops_of
+from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
+from diffrigid.linkage import islands
 from diffrigid.numerics import apart, constant, dot, norm, opaque_true, rows, some
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace, HeightField, Profile
@@ -24,18 +26,27 @@ from diffrigid.state import rotations
 
 
 def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array) -> Strikes:
-    """The contacts of every pair at its next impact or, where `at_end` (a bool), at the end of the step.
+    """The contacts of every pair at its next impact, or where it is held until; all at the end where `at_end` (a bool).
 
     Active are those that touch then; of the next impact, only if it happens before the end.
     """
-    width, parts = world.contact.width, []
-    for pairs in world.pairs:
-        each = jax.vmap(lambda a, b: strikes_of(world, a, b, dt, at_end, width))
-        part = apart(opaque_true(dt), each, *sides_of(world, pairs, flight, since))
-        parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
-    jac = None
+    width = world.contact.width
+    groups = [sides_of(world, pairs, flight, since) for pairs in world.pairs]
+    meetings = [jax.vmap(lambda a, b: meet(world, a, b, dt, at_end, width))(*sides) for sides in groups]
     if stops_of(world):
-        stops = find_stops(world, flight, since, dt, at_end)
+        meetings.append(meet_stops(world, flight, since, dt, at_end))
+    a, b = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
+    hang_together = islands(world.joints, len(world.names))
+    bounces = _coefficients(world, "restitution", a, b, dt.shape) > 0 if waits(world) else None
+    a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
+    meetings = in_order(meetings, a, b, hang_together, flight.t0, dt, at_end, bounces)
+    parts, jac = [], None
+    for sides, meeting in zip(groups, meetings, strict=False):
+        each = jax.vmap(lambda a, b, meeting: strikes_of(a, b, meeting, dt))
+        part = apart(opaque_true(dt), each, *sides, meeting)
+        parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
+    if stops_of(world):
+        stops = find_stops(world, flight, meetings[-1])
         jac = stops.jac
         parts.append(replace(stops, jac=None))
     if len(parts) > 1:
@@ -45,41 +56,60 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     return replace(strikes, **ends(world), jac=jac)
 
 
-def strikes_of(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Strikes:
+def waits(world: Any) -> bool:
+    """Whether what rests may have to be held until an impact: something acts on it, and it meets several. Static."""
+    column = ends(world)
+    pairs = tuple(dict.fromkeys(zip(column["a"], column["b"], strict=True)))
+    alone = are_alone(*zip(*pairs, strict=True), len(world.names))
+    return any(driven(world)) or (bool(world.forces) and not alone)
+
+
+def meet(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
+    """The next impact of one pair, or the end of the step where `at_end` (a bool)."""
+    straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
+    return find_impact(a, b, dt, width, straight, world.contact.rest_speed, at_end)
+
+
+def next_strikes(world: Any, a: Side, b: Side, dt: Array) -> Strikes:
+    """The contacts of one pair at its next exact impact, (K, ...)."""
+    meeting, never = meet(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
+    return strikes_of(a, b, replace(meeting, now=meeting.fast, joins=never, held=never), dt)
+
+
+def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array) -> Strikes:
     """The contacts of one pair, (K, ...); see `find_strikes`.
 
     A resting force acts evenly over the time since the last impact, so its impulse at the middle of that. There
     the bodies were elsewhere: the arms are those to one point that both had then, which keeps angular momentum.
     On a static the body did not fall through the surface: its arm is to its own surface, not to the middle of a gap.
     """
-    both_move = a.flight is not None and b.flight is not None
-    straight, rest_speed = relative_path_is_straight(world, both_move), world.contact.rest_speed
-    s, hit, level, slack, rests = find_impact(a, b, dt, width, straight, rest_speed, at_end)
+    both_move, s, held = a.flight is not None and b.flight is not None, meeting.s, meeting.held
     live = opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
     contacts = contacts_of(a, at_a, b, at_b)
-    # At the end those too that the next of a pile fell away from, which may close again once it is held.
-    opened = jnp.where(at_end, dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None), 0.0)
-    active = (contacts.gap <= (level + slack + opened)[None]) & hit[None]
+    # Those too that the next of a pile fell away from, which may close again once that is held, or struck.
+    opened = jnp.where(held | meeting.joins, dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None), 0.0)
+    active = (contacts.gap <= (meeting.level + meeting.slack + opened)[None]) & meeting.hit[None]
     drift = jnp.zeros_like(at_a.x)
     if both_move:
         drift = 0.5 * (at_a.v - at_b.v)  # type: ignore[operator]
-        held = jnp.where(at_end, 0.5 * (dt - jnp.maximum(a.flight.t0, b.flight.t0)), 0.0)
-        mid_shift = held[None] * drift
+        lasted = jnp.where(held, 0.5 * (s - jnp.maximum(a.flight.t0, b.flight.t0)), 0.0)
+        mid_shift = lasted[None] * drift
 
     def each(normal, point, gap):
-        shift = mid_shift if both_move else jnp.where(at_end, 0.5 * gap, 0.0)[None] * normal
+        shift = mid_shift if both_move else jnp.where(held, 0.5 * gap, 0.0)[None] * normal
         arm_a, arm_b = point - at_a.x + shift, point - at_b.x - shift
         pulls = [_acceleration(side, at, s, arm) for side, at, arm in ((a, at_a, arm_a), (b, at_b, arm_b))]
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
-        touching = (gap > 0) & (gap <= slack)  # open by no more than rounding
+        touching = (gap > 0) & (gap <= meeting.slack)  # open by no more than rounding
         return Strikes(
             active=gap < 0, s=s, gap=jnp.where(touching, 0.0, gap), normal=normal, arm_a=arm_a, arm_b=arm_b,
             K=effective_matrix(at_a, arm_a, at_b, arm_b), v_rel=relative_velocity(at_a, arm_a, at_b, arm_b),
-            pull=pull, drift=drift, rests=rests,
+            pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip
 
-    return replace(jax.vmap(each)(contacts.normal, contacts.point, contacts.gap), active=active)
+    strikes = jax.vmap(each)(contacts.normal, contacts.point, contacts.gap)
+    return replace(strikes, active=active, rests=meeting.rests)
 
 
 def relative_path_is_straight(world: Any, both_move: bool) -> bool:
@@ -182,7 +212,12 @@ def law(a: list[Material], b: list[Material], strike: Strikes) -> tuple[Array, A
 def coefficients(world: Any, name: str, batch: tuple[int, ...]) -> Array:
     """A coefficient, by its name, of all contacts and rows, (C, *batch) or what broadcasts."""
     index = {side: ends(world)[side][: contact_count(world)] for side in "ab"}
-    parts = [mixed(*(material(world, name, index[side]) for side in "ab"))] if world.pairs else []
+    return _coefficients(world, name, index["a"], index["b"], batch)
+
+
+def _coefficients(world: Any, name: str, a: tuple[int, ...], b: tuple[int, ...], batch: tuple[int, ...]) -> Array:
+    """The same between colliders a and b, and behind them those of the rows of joints."""
+    parts = [mixed(*(material(world, name, side) for side in (a, b)))] if world.pairs else []
     if stops_of(world):
         kinds = ("lower", "upper") if name == "restitution" else ()
         parts.append(of_stops(world, "restitution", kinds, 0.0, batch))

@@ -39,7 +39,7 @@ CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the f
 ROUGH = 1e-2  # with this relative error, and then with as little as it can
 PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
 SMOOTHING = 3  # rounds after each Newton step
-PATIENCE = 3  # rounds that do not lessen a small error: then it is rounding
+PATIENCE = 3  # rounds that do not halve a small error: then it is rounding
 REFINEMENTS = 8  # of the linear system of the derivative
 
 
@@ -156,14 +156,16 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
     takes a share of the masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
     """
     rounding = jnp.finfo(v_rel.dtype).eps
-    tolerance, stuck, least = 16.0 * rounding, 3.0 * rounding**0.5, rounding**0.6 * cone.rest_speed
+    least, stuck = rounding**0.6 * cone.rest_speed, 3.0 * rounding**0.5
 
     def lacks(best, error, since):
-        small = jnp.where(since < PATIENCE, tolerance, jnp.where(since < 5 * PATIENCE, stuck, jnp.inf))
+        small = jnp.where(since < 5 * PATIENCE, stuck, jnp.inf)
+        small = jnp.where(since < 2 * PATIENCE, rounding**0.6, small)
+        small = jnp.where(since < PATIENCE, 16.0 * rounding, small)
         return error > small * speed(best) + least
 
     def busy(carry):
-        return (carry[0] < ROUNDS) & some(lacks(*carry[4:]))
+        return (carry[0] < ROUNDS) & some(lacks(*carry[4:7]))
 
     def speed(P):
         return jnp.max(cone.scale[:, None] * jnp.abs(P), (0, 1))
@@ -176,36 +178,39 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         z = _excess(cone, P, v_rel, arms, mobility)
         return z, allowed(cone, z) - P
 
-    def roughly(count, P, since, best, error):
-        del P
+    def circling(best, error):
+        return error > stuck * speed(best) + least
 
+    def roughly(count, P, since, best, error):
         def wrong(P):
             return speed(lacking(P)[1])
 
-        share = jnp.where(count > CIRCLES, 0.0, ROUGH).astype(v_rel.dtype)
-        enough = jnp.where(lacks(best, error, since), share * speed(best) + least, jnp.inf)
-        return solve_roughly(cone, v_rel, arms, mobility, wrong, enough), jnp.zeros_like(since)
+        lost, share = circling(best, error), jnp.where(count > CIRCLES, 0.0, ROUGH).astype(v_rel.dtype)
+        enough = jnp.where(lost, share * speed(best) + least, jnp.inf)
+        other = solve_roughly(cone, v_rel, arms, mobility, wrong, enough)
+        return jnp.where(lost[None, None], other, P), jnp.where(lost, 0, since)
 
     def again(carry):
-        count, P, z, r, best, error, since = carry
+        count, P, z, r, best, error, since, mark = carry
         slope = _slope(cone, z)
         matrix = bodies_matrix(_answer(slope, cone), arms, mobility)
         dP = _newton_step(r, lambda u: solve_regular(matrix, u[:, None])[:, 0], slope, cone, arms, mobility)
         P = lax.fori_loop(0, SMOOTHING, smoother, allowed(cone, P + dP))
         if mobility.inverse_mass.shape[0] >= PILE:
-            again_now = (count > 0) & (count % CIRCLES == 0)
+            again_now = (count > 0) & (count % CIRCLES == 0) & some(circling(best, error))
             P, since = lax.cond(again_now, roughly, lambda _, *kept: kept[:2], count, P, since, best, error)
         z, r = lacking(P)
         size = speed(r)
         better = size < error
-        best, since = jnp.where(better[None, None], P, best), jnp.where(better, 0, since + 1)
-        return count + 1, P, z, r, best, jnp.minimum(size, error), since
+        best, halved = jnp.where(better[None, None], P, best), size < 0.5 * mark
+        since, mark = jnp.where(halved, 0, since + 1), jnp.where(halved, size, mark)
+        return count + 1, P, z, r, best, jnp.minimum(size, error), since, mark
 
     def iterate(nothing):
         P = smoother(0, nothing)
         z, r = lacking(P)
         error = speed(r)
-        return lax.while_loop(busy, again, (0, P, z, r, P, error, jnp.zeros_like(error, np.int32)))[4]
+        return lax.while_loop(busy, again, (0, P, z, r, P, error, jnp.zeros_like(error, np.int32), error))[4]
 
     return lax.cond(shared, iterate, lambda nothing: nothing, jnp.zeros_like(v_rel))
 

@@ -1,0 +1,141 @@
+"""What acts when: a body meets what it strikes first, and until then others hold it up.
+
+What hangs together, because it rests on each other or by joints, does not fall freely to the next impact of one of its
+bodies. A pass of its own holds it until then, as the end of a step does; the impact itself is that of a later pass.
+One without restitution then acts on all of them together, as far as there is none between them: passed on from each to
+the next it would never end. With restitution it is passed on (Newton's cradle).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.contact.sides import at_colliders, body_sides
+from diffrigid.numerics import rows, some
+from diffrigid.pytree import array, pytree, replace
+
+SOON = 1e-4  # [-] of a step: what is held no longer than this need not be
+
+
+@pytree
+class Meeting:
+    """When two colliders meet, or the two bodies of a joint come to its limit; many with a leading axis."""
+
+    s: Array = array()  # [s] of the impact, if there is one before the end of the step; else its end
+    hit: Array = array()  # bool: there is, or contacts are those of the end
+    fast: Array = array()  # bool: an impact that is not slow
+    rests: Array = array("K")  # bool, of each contact: it touches from the start of the path on
+    level: Any = array(default=None)  # [m] of the gap at which they meet
+    slack: Any = array(default=None)  # [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size
+    now: Any = array(default=None)  # bool: is the turn of this impact
+    joins: Any = array(default=None)  # bool: is the turn of one that those which rest here take part in
+    held: Any = array(default=None)  # bool: s is the time until which what rests is held
+
+
+def in_order(
+    meetings: list[Meeting], a: tuple[int, ...], b: tuple[int, ...], islands: tuple, t0: Array, dt: Array,
+    at_end: Array, bounces: Array | None,
+) -> list[Meeting]:  # fmt: skip
+    """Whose turn it is: the meetings with `now` and `held`.
+
+    Args:
+        meetings: between colliders a and b, M in all.
+        islands: for each of N bodies, those that hang together with it by joints. An impact reaches all of them.
+        t0: (N, *batch) [s] where their paths begin.
+        at_end: bool; True: all are at the end of the step.
+        bounces: (M, *batch) bool: there is restitution between them. None: no bodies have to be held until an impact.
+    """
+    s, fast, rests = (
+        jnp.concatenate(parts) for parts in zip(*((m.s, m.fast, m.rests.any(1)) for m in meetings), strict=True)
+    )
+    tie = jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt[None]
+
+    def first_of(impacts: Array) -> Array:
+        return _of_bodies(jnp.min, jnp.where(impacts, s, jnp.inf), a, b, islands, jnp.inf)
+
+    def earliest(of_bodies: Array) -> Array:
+        return jnp.minimum(at_colliders(of_bodies, a, jnp.inf), at_colliders(of_bodies, b, jnp.inf))
+
+    first = first_of(fast)
+    now, held = jnp.abs(lax.stop_gradient(s - earliest(first))) <= tie, jnp.broadcast_to(at_end, s.shape)
+    joins = jnp.zeros_like(now)
+    if bounces is not None:
+
+        def of_clusters(first: Array, first_bounce: Array) -> tuple[Array, Array]:
+            return _of_clusters(first, first_bounce, rests, a, b, islands, t0, dt)
+
+        def free(first: Array, _: Array) -> tuple[Array, Array]:
+            return (jnp.full_like(first, jnp.inf),) * 2
+
+        of_both = lax.cond(some(rests) & some(fast), of_clusters, free, first, first_of(fast & bounces))
+        until, along = map(earliest, of_both)
+        waits, joins = until < jnp.inf, (rests | now) & ~bounces & (along < jnp.inf)
+        now, held = (now & ~waits) | joins, held | (waits & rests)
+        s = jnp.where(waits & rests, until, jnp.where(joins, along, s))
+    ordered, start = [], 0
+    for m in meetings:
+        own = slice(start, start + len(m.s))
+        hit = m.hit | held[own] | joins[own]
+        ordered.append(
+            replace(m, s=s[own], hit=hit, now=now[own] & ~at_end, joins=joins[own] & ~at_end, held=held[own])
+        )
+        start += len(m.s)
+    return ordered
+
+
+def hanging_together(on: Array, a: tuple[int, ...], b: tuple[int, ...], islands: tuple) -> Array:
+    """For each of N bodies the least of those that it hangs together with, (N, *batch) int.
+
+    Args:
+        on: (M, *batch) bool: colliders a and b do. Statics hold nothing together.
+    """
+    moving = len(islands)
+    number = lax.broadcasted_iota(jnp.int32, (moving, *on.shape[1:]), 0)
+
+    def spread(carry: tuple) -> tuple:
+        label, _ = carry
+        least = jnp.minimum(at_colliders(label, a, moving), at_colliders(label, b, moving))
+        least = jnp.minimum(label, _of_bodies(jnp.min, jnp.where(on, least, moving), a, b, islands, moving))
+        return least, some(least < label)
+
+    return lax.while_loop(lambda carry: carry[1], spread, (number, jnp.asarray(True)))[0]
+
+
+def _of_clusters(
+    first: Array, first_bounce: Array, rests: Array, a: tuple[int, ...], b: tuple[int, ...], islands: tuple, t0: Array,
+    dt: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Until when each body is held, and when it takes part in an impact without restitution; (N, *batch) [s].
+
+    Infinity: it is not, or does not.
+
+    Args:
+        first, first_bounce: (N, *batch) [s] its own next impact, and that with restitution.
+        rests: (M, *batch) bool: colliders a and b touch.
+    """
+    label = hanging_together(rests, a, b, islands)
+    member = label[None] == label[:, None]
+    until, bounce, begins = (jnp.where(member, t[None], jnp.inf).min(1) for t in (first, first_bounce, t0))
+    supported = (member & _of_bodies(jnp.max, rests, a, b, islands, False)[None]).any(1) & (until < jnp.inf)
+    waits = until - begins > SOON * dt[None]
+    held, along = supported & waits, supported & ~waits & (until < bounce)
+    return jnp.where(held, until, jnp.inf), jnp.where(along, until, jnp.inf)
+
+
+def _of_bodies(
+    reduce: Callable, values: Array, a: tuple[int, ...], b: tuple[int, ...], islands: tuple, none: Any
+) -> Array:
+    """Values (M, *batch) between colliders a and b reduced for each body, (N, *batch); `none` if there are none."""
+    padded = jnp.concatenate([values, values, jnp.full_like(values[:1], none)])
+    return over_islands(reduce, reduce(rows(padded, body_sides(a, b, len(islands))), axis=1), islands, none)
+
+
+def over_islands(reduce: Callable, values: Array, islands: tuple, none: Any) -> Array:
+    """Values of the bodies (N, ...) reduced over those that hang together with each, (N, ...)."""
+    most = max(map(len, islands))
+    if most == 1:
+        return values
+    padded = jnp.concatenate([values, jnp.full_like(values[:1], none)])
+    return reduce(rows(padded, tuple(i + (len(islands),) * (most - len(i)) for i in islands)), axis=1)
