@@ -10,6 +10,7 @@ from closed_form import bouncing, disc_and_plane, final, made, simulated, steps_
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid import so3
 
 ROUNDING = 1e-12  # relative: sums of some hundred terms
 PUSHED = 1e-8  # relative energy: bodies that roll on each other are moved apart by what a step overlooked
@@ -231,6 +232,33 @@ def test_energy_with_the_potential_never_rises_on_a_floor(dim, friction, e, kept
     energy = kinetic + GRAVITY * (mass[None] * states.x[:, :, 1]).sum(1)
     assert np.diff(energy).max() < GROWN * energy[0]
     assert energy[-1] < kept * energy[0]
+
+
+@pytest.mark.slow
+def test_slopes_where_friction_is_lessened():
+    """A box in space that lands on an edge, on two corners at once, which with all of its friction would gain energy."""
+
+    def after(p):
+        v, turn = jnp.stack([p["v"], 0.0 * p["v"], -3.0 + 0.0 * p["v"]]), vector(0.0, p["turn"], 0.0)
+        box = dr.Body(
+            dr.Box(half=(0.3, 0.4, 0.2)), mass=p["mass"], inertia=(0.05,) * 3, x=(0.0, 0.0, 0.45), v=v,
+            q=so3.exp(turn), w=(0.0, 4.47, 0.0),
+        )  # fmt: skip
+        floor = dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))
+        world, state = dr.scene({"box": box, "floor": floor}, restitution=1.0, friction=p["friction"])
+        end = dr.step(world, state, 0.06)
+        gained = dr.kinetic_energy(world.bodies, end)[0] - dr.kinetic_energy(world.bodies, state)[0]
+        return jnp.concatenate([end.v[0], end.w[0]]), gained
+
+    p = jax.tree.map(jnp.asarray, {"v": 3.67, "turn": 1.3, "mass": 1.1, "friction": 0.5})
+    run = jax.jit(after)
+    velocities, gained = run(p)
+    assert velocities[0] < 3.0  # it was rubbed
+    assert abs(gained) < 1e-12  # and neither gained nor lost: some of the friction is left out
+    slopes = jax.jit(jax.jacfwd(lambda p: after(p)[0]))(p)
+    for name, slope in slopes.items():
+        high, low = (run(p | {name: p[name] + h})[0] for h in (1e-6, -1e-6))
+        assert_allclose(slope, (high - low) / 2e-6, atol=1e-6)
 
 
 # ---- a free top

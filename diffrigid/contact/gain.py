@@ -17,9 +17,10 @@ from jax import Array, lax
 from diffrigid.contact.cone import Cone
 from diffrigid.contact.impulse import within_energy
 from diffrigid.contact.mobility import Arms, Mobility, moved
-from diffrigid.contact.sides import at_colliders, at_pairs, body_sides, pair_sum, pairs_of
+from diffrigid.contact.order import hanging_together
+from diffrigid.contact.sides import at_colliders, at_pairs, pair_sum, pairs_of
 from diffrigid.contact.together import solve_together
-from diffrigid.numerics import dot, rows, some
+from diffrigid.numerics import dot, some
 from diffrigid.pytree import replace
 
 
@@ -64,22 +65,12 @@ def _summed(cone: Cone, arms: Arms, mobility: Mobility, *values: Array) -> list[
     """Sums of values (C, *batch) over all contacts that hang together with each of them, each (C, *batch)."""
     moving, (a, b) = mobility.inverse_mass.shape[0], pairs_of(arms.a, arms.b)
     by_pair = pair_sum(jnp.stack([cone.on, *values], axis=1), arms.a, arms.b)
-    number = lax.broadcasted_iota(by_pair.dtype, (moving, *by_pair.shape[2:]), 0)
-    none = jnp.full_like(number[:1], moving)
-
-    def of_pairs(label: Array) -> Array:
-        least = jnp.minimum(at_colliders(label, a, moving), at_colliders(label, b, moving))
-        return jnp.where(by_pair[:, 0] > 0, least, moving)
-
-    def spread(_: int, label: Array) -> Array:
-        least = of_pairs(label)
-        touching = rows(jnp.concatenate([least, least, none]), body_sides(a, b, moving))
-        return jnp.minimum(label, touching.min(1))
-
+    number = lax.broadcasted_iota(jnp.int32, (moving, *by_pair.shape[2:]), 0)
     if mobility.matrix is None:
-        label = of_pairs(lax.fori_loop(0, moving - 1, spread, number))
+        body = hanging_together(by_pair[:, 0] > 0, a, b, tuple((i,) for i in range(moving)))
+        label = jnp.minimum(at_colliders(body, a, moving), at_colliders(body, b, moving))
     else:  # joints may hold all of them together
-        label = jnp.zeros_like(by_pair[:, 0])
+        label = jnp.zeros(by_pair[:, 0].shape, jnp.int32)
     member = (label[None] == number[:, None]).astype(by_pair.dtype)
     sums = (member[:, :, None] * by_pair[None]).sum(1)
     each = at_pairs((member[:, :, None] * sums[:, None]).sum(0), arms.a, arms.b)

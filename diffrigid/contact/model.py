@@ -1,6 +1,7 @@
 """`Contact`: from the free flight of a step to the state at its end, in passes over one list of contacts.
 
-    IMPACT, as often as `sweeps`   the next impact of every body, at its true time, with restitution
+    IMPACT, as often as `sweeps`   the next impact of every body, at its true time, with restitution; before it what
+                                   rests is held until then (`order.py`)
     HOLD                           what rests, at the end of the step: the velocities must not close
     PUSH                           what rests: gaps that rounding or rolling left are closed; momenta are kept,
                                    energy to the order of the gap
@@ -10,7 +11,7 @@ in the time, the target of the law, and in how long the impulse has acted. A pas
 needs is skipped. An impact that the sweeps leave over is found late by the next step, with a negative time,
 and repaired.
 
-A resting contact force is taken as constant since the last impact of the body, a time T before the end: it
+A resting contact force is taken as constant since the last impact of the body, a time T before: it
 gives P, so v += P / m and x += (T / 2) P / m, its centroid being in the middle. For a block that slides on a
 floor under Coulomb friction this is exact.
 """

@@ -57,11 +57,12 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
 
 
 def waits(world: Any) -> bool:
-    """Whether what rests may have to be held until an impact: something acts on it, and it meets several. Static."""
-    column = ends(world)
+    """Whether what rests may have to be held until an impact: something acts on it, and it meets others. Static."""
+    column, drives = ends(world), driven(world)
     pairs = tuple(dict.fromkeys(zip(column["a"], column["b"], strict=True)))
-    alone = are_alone(*zip(*pairs, strict=True), len(world.names))
-    return any(driven(world)) or (bool(world.forces) and not alone)
+    a, b = zip(*pairs, strict=True)
+    alone = are_alone(a, b, len(world.names))
+    return not all(drives) and (any(drives) or (bool(world.forces) and not alone))
 
 
 def meet(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
