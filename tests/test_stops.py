@@ -81,6 +81,7 @@ def test_a_damping_that_no_step_resolves_stops_the_joint():
     assert np.isfinite(np.asarray(slope)).all()
 
 
+@pytest.mark.slow
 def test_a_hinge_in_space_stops_as_in_the_plane():
     along = {"upper": 1.0, "restitution": 0.6, "friction": 0.1, "damping": 0.02}
     flat, space = (jax.jit(lambda w, dim=dim: turned(wheel(w, dim, **along), 1.0))(1.7) for dim in (2, 3))
