@@ -158,7 +158,7 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
     first = unit_vector(jnp.zeros((so.D, *s.shape), s.dtype), 0)
     none, gap = jnp.zeros_like(first), _gap(kind, joint, a, b)
     open_by = jnp.zeros_like(s) if kind == "friction" else gap(s)
-    touches = ~meeting.held | (open_by <= jnp.sqrt(jnp.finfo(s.dtype).eps))
+    touches = ~meeting.held | meeting.rests[0] | (open_by <= jnp.sqrt(jnp.finfo(s.dtype).eps))
     return Strikes(
         active=meeting.hit & touches, s=s, gap=open_by, normal=first, arm_a=none, arm_b=none,
         K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,

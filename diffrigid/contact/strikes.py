@@ -90,7 +90,8 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array) -> Strikes:
     contacts = contacts_of(a, at_a, b, at_b)
     # Those too that the next of a pile fell away from, which may close again once that is held, or struck.
     opened = jnp.where(held | meeting.joins, dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None), 0.0)
-    active = (contacts.gap <= (meeting.level + meeting.slack + opened)[None]) & meeting.hit[None]
+    near = contacts.gap <= (meeting.level + meeting.slack + opened)[None]
+    active = (near | (meeting.rests & held[None])) & meeting.hit[None]
     drift = jnp.zeros_like(at_a.x)
     if both_move:
         drift = 0.5 * (at_a.v - at_b.v)  # type: ignore[operator]
