@@ -55,7 +55,15 @@ def test_a_motor_reaches_its_speed_and_dry_friction_stops_it():
 
 
 def test_a_limit_is_struck_at_its_time():
-    """And friction acts until then, and from then on until the wheel stops."""
+    check_with_slopes(
+        lambda w, upper, e: turned(wheel(w, upper=upper, restitution=e), 1.0)[0],
+        lambda w, upper, e: upper - e * (w - upper),
+        (1.7, 1.0, 0.6),
+    )
+
+
+def test_a_limit_of_a_joint_that_rubs_is_struck_at_its_time():
+    """Friction acts until then, and from then on until the wheel stops."""
     check_with_slopes(
         lambda w, upper, e, torque: turned(wheel(w, upper=upper, restitution=e, friction=torque), 2.0)[0],
         lambda w, upper, e, torque: upper - e**2 * (INERTIA * w**2 / (2 * torque) - upper),
