@@ -102,10 +102,9 @@ def apply(inverse: Array, tau: Array) -> Array:
     return inverse[None] * tau
 
 
-def mobility(inverse: Array, r: Array) -> Array:
-    """Velocity at r for a unit force impulse at r, by rotation alone: (2, 2, *batch), I^-1 r_perp r_perp^T."""
-    across = perp(r)
-    return inverse[None, None] * across[:, None] * across[None]
+def mobility(inverse: Array, r: Array, mid: Array) -> Array:
+    """Velocity at r for a unit impulse at mid, by rotation alone: (2, 2, *batch), I^-1 r_perp mid_perp^T."""
+    return inverse[None, None] * perp(r)[:, None] * perp(mid)[None]
 
 
 def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:

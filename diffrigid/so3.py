@@ -157,11 +157,11 @@ def world_inverse(inverse: Array, q: Array) -> Array:
 apply = matrix_product  # I^-1 tau, both in world axes
 
 
-def mobility(inverse: Array, r: Array) -> Array:
-    """Velocity at r for a unit force impulse at r, by rotation alone: (3, 3, *batch), -[r] I^-1 [r]."""
+def mobility(inverse: Array, r: Array, mid: Array) -> Array:
+    """Velocity at r for a unit impulse at mid, by rotation alone: (3, 3, *batch), -[r] I^-1 [mid]."""
     cross_rows = jax.vmap(cross, in_axes=(None, 0))
     half = cross_rows(r, jnp.swapaxes(inverse, 0, 1))  # rows: r x (column of I^-1)
-    return cross_rows(r, jnp.swapaxes(half, 0, 1))
+    return jnp.swapaxes(cross_rows(mid, jnp.swapaxes(half, 0, 1)), 0, 1)
 
 
 def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:

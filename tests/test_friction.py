@@ -8,6 +8,7 @@ from closed_form import vector, with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid.state import rotations
 
 G = 9.81
 
@@ -85,6 +86,48 @@ def test_cradle_of_touching_balls():
     end = dr.rollout(world, state, dt=1 / 60, steps=120).state
     assert_allclose(end.v[-1], np.eye(6)[4][:, None] * [2.0, 0.0], atol=1e-9)
     assert_allclose(end.x[-1, :, 0], [0.0, 1.0, 2.0, 3.0, 6.0, -1.0], atol=1e-8)
+
+
+def tipping(mu, w, inertia):
+    """Angle and angular velocity of a box of mass 1 after 0.2 s in which it tips over its corner, from 0.3 rad and w."""
+    corner, lean = vector(0.1, -0.3), jnp.asarray(0.3)
+    r = -rotations(2).rotate(vector(jnp.cos(lean), -jnp.sin(lean)), corner)
+    box = dr.Body(
+        dr.Box(half=(0.1, 0.3)), mass=1.0, inertia=inertia, x=r, angle=-lean, v=-w * vector(-r[1], r[0]), w=-w
+    )  # fmt: skip
+    world, state = dr.scene({"box": box, "floor": floor()}, gravity=(0.0, -G), friction=mu)
+    end = dr.rollout(world, state, dt=1 / 240, steps=48).state
+    return -jnp.stack([jnp.arctan2(end.q[-1, 0, 1], end.q[-1, 0, 0]), end.w[-1, 0, 0]])
+
+
+def tipping_in_theory(mu, w, inertia):
+    """The equation of motion of the corner's angle, by the rule of Runge and Kutta; the corner sticks, or is free."""
+    length, corner, h = jnp.sqrt(0.1), jnp.arctan2(0.1, 0.3), 1e-4
+
+    def rate(y):
+        angle, w = y
+        pull = G * length * jnp.sin(angle)
+        across = (length * jnp.sin(angle)) ** 2
+        sliding = (pull - across / jnp.tan(angle) * w**2) / (inertia + across)
+        return jnp.stack([w, jnp.where(mu > 0, pull / (inertia + length**2), sliding)])
+
+    def step(_, y):
+        a = rate(y)
+        b = rate(y + 0.5 * h * a)
+        c = rate(y + 0.5 * h * b)
+        return y + h / 6 * (a + 2 * b + 2 * c + rate(y + h * c))
+
+    return jax.lax.fori_loop(0, 2000, step, jnp.stack([0.3 - corner, w])) + jnp.stack([corner, 0.0])
+
+
+def test_a_box_tips_over_its_corner():
+    """With the corner at rest, and sliding without friction: of second order in the step, and so are the slopes."""
+    way = jax.jit(lambda *p: (tipping(*p), *jax.jacfwd(tipping, (1, 2))(*p)))
+    for mu, value, slope in ((0.0, 3e-5, 3e-3), (100.0, 5e-6, 5e-5)):
+        p = tuple(map(jnp.asarray, (mu, 0.5, 0.04)))
+        motion, *slopes = way(*p)
+        assert_allclose(motion, tipping_in_theory(*p), atol=value)
+        assert_allclose(slopes, jax.jacfwd(tipping_in_theory, (1, 2))(*p), atol=slope)
 
 
 def test_a_block_slides_into_another():

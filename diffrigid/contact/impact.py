@@ -125,10 +125,17 @@ def closed_form(a: Shape, b: Shape, straight: bool) -> bool:
 
 def _earliest(a: Side, b: Side) -> tuple[Array, Array]:
     """Time from which both paths hold, and how far back a late impact may be repaired."""
+    start = began(a, b)
     if b.flight is None or a.flight is None:
-        side = a if b.flight is None else b
-        return side.flight.t0, side.since
-    return jnp.maximum(a.flight.t0, b.flight.t0), jnp.maximum(a.since, b.since)
+        return start, (a if b.flight is None else b).since
+    return start, jnp.maximum(a.since, b.since)
+
+
+def began(a: Side, b: Side) -> Array:
+    """Time from which both paths hold, (*batch) [s]."""
+    if b.flight is None or a.flight is None:
+        return (a if b.flight is None else b).flight.t0
+    return jnp.maximum(a.flight.t0, b.flight.t0)
 
 
 def _approach_straight(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from diffrigid.contact.levers import Levers
 from diffrigid.contact.sides import Placed
 from diffrigid.numerics import dot, safe_divide, safe_sqrt
 from diffrigid.so2 import perp
@@ -41,20 +42,21 @@ def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -
     return restitution / jnp.sqrt(jnp.sqrt(1.0 + falloff * jnp.where(u > 0, u, 0.0)))
 
 
-def effective_matrix(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
-    """K, (D, D, *batch) [1/kg]: change of the relative velocity for a unit impulse at these arms (D, *batch) [m]."""
+def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
+    """K, (D, D, *batch) [1/kg]: change of the relative velocity, at the arms of the end, for a unit impulse."""
     K: Any = 0.0
-    for at, arm in ((at_a, arm_a), (at_b, arm_b)):
+    for at, arm, mid in ((at_a, lever.arm_a, lever.mid_a), (at_b, lever.arm_b, lever.mid_b)):
         if at.v is not None:
             dim = at.x.shape[0]
             unit = jnp.eye(dim, dtype=at.x.dtype).reshape(dim, dim, *[1] * (at.x.ndim - 1))
-            K = K + at.inverse_mass[None, None] * unit + rotations(dim).mobility(at.inverse_inertia, arm)
+            turned = rotations(dim).mobility(at.inverse_inertia, arm, arm if mid is None else mid)
+            K = K + at.inverse_mass[None, None] * unit + turned
     return K
 
 
 def times(K: Array, P: Array) -> Array:
-    """K P, (D, D, *batch), (D, *batch) -> (D, *batch). K is symmetric."""
-    return jax.vmap(dot, in_axes=(1, None))(K, P)
+    """K P, (D, D, *batch), (D, *batch) -> (D, *batch)."""
+    return jax.vmap(dot, in_axes=(0, None))(K, P)
 
 
 def impulses(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
@@ -77,8 +79,7 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
     """
     basis, axes = _contact_frame(n), range(n.shape[0])
     moved = [times(K, e) for e in basis]
-    upper = {(i, j): dot(basis[i], moved[j]) for j in axes for i in range(j + 1)}
-    k = [[upper[min(i, j), max(i, j)] for j in axes] for i in axes]
+    k = [[dot(basis[i], moved[j]) for j in axes] for i in axes]
     v_n, *v_t = [dot(e, v) for e in basis]
     gamma = jnp.maximum(safe_divide(target - v_n, k[0][0]), 0.0)
     after = [v_i + gamma * k_in for v_i, (k_in, *_) in zip([v_n, *v_t], k, strict=True)]
@@ -116,21 +117,19 @@ def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array) -> list:
 def _stopping_impulse(k: list, slip: list) -> list:
     """-K^-1 (0, slip), by cofactors, 2 x 2 or 3 x 3; 0 where K is singular."""
     if len(k) == 2:
-        (nn, nt), (_, tt) = k
-        share = safe_divide(slip[0], nn * tt - nt * nt)
+        (nn, nt), (tn, tt) = k
+        share = safe_divide(slip[0], nn * tt - nt * tn)
         return [nt * share, -nn * share]
-    (nn, ns, nt), (_, ss, st), (_, _, tt) = k
-    # rows of the adjugate for the two tangents s and t
-    ns_, nt_, ss_, st_, tt_ = (
-        st * nt - ns * tt,
-        ns * st - ss * nt,
-        nn * tt - nt * nt,
-        ns * nt - nn * st,
-        nn * ss - ns * ns,
-    )
-    det = nn * (ss * tt - st * st) + ns * ns_ + nt * nt_
+    n, *others = k
+
+    def minors(p: list, q: list) -> list:
+        return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
+
+    # columns of the adjugate for the two tangents s and t
+    by_s, by_t = minors(others[1], n), minors(n, others[0])
+    det = sum(k_s * c for k_s, c in zip(others[0], by_s, strict=True))
     s, t = slip
-    return [-safe_divide(P, det) for P in (ns_ * s + nt_ * t, ss_ * s + st_ * t, st_ * s + tt_ * t)]
+    return [-safe_divide(c_s * s + c_t * t, det) for c_s, c_t in zip(by_s, by_t, strict=True)]
 
 
 def sticking_impulse(K: Array, n: Array, slip: Array) -> Array:

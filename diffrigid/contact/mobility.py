@@ -27,6 +27,8 @@ class Arms:
 
     arm_a: Array = array("C", "D")
     arm_b: Array = array("C", "D")
+    mid_a: Any = array("C", "D", default=None)  # where impulses act; None: where velocities are, at the arms
+    mid_b: Any = array("C", "D", default=None)
     jac: Any = array("R", "2", "D + A", default=None)  # of each coordinate by the twists of a and b
     spin: Any = array("K", default=None)
     a: tuple[int, ...] = static()
@@ -52,7 +54,8 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
     so = rotations(P.shape[1])
     points, along, every = _points(arms), P[len(P) - _rows(arms) :, :1], P
     P = P[:points]
-    push, moments = ([P], [-P]), tuple([jax.vmap(so.moment)(arm[:points], P)] for arm in (arms.arm_a, -arms.arm_b))
+    mid_a, mid_b = mids(arms)
+    push, moments = ([P], [-P]), tuple([jax.vmap(so.moment)(arm[:points], P)] for arm in (mid_a, -mid_b))
     if arms.spin is not None:
         for sign, pushes, turns in zip((1.0, -1.0), push, moments, strict=True):
             pushes.append(jnp.zeros_like(P))
@@ -66,6 +69,11 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
         return side_sum(_joined(on_a), _joined(on_b), arms.a, arms.b, moving)
 
     return total(*push), total(*moments)
+
+
+def mids(arms: Any) -> tuple[Array, Array]:
+    """Where impulses act on bodies a and b, (C, D, *batch) [m]."""
+    return (arms.arm_a, arms.arm_b) if arms.mid_a is None else (arms.mid_a, arms.mid_b)
 
 
 def _joined(parts: list[Array]) -> Array:
@@ -171,15 +179,19 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     moving, (D, *batch) = mobility.inverse_mass.shape[0], arms.arm_a.shape[1:]
     so = rotations(D)
     size = D + so.A
-    J_a, J_b = (jax.vmap(lambda arm: _by_units(so, arm))(arm) for arm in (arms.arm_a, arms.arm_b))  # (C, size, D)
-    if arms.spin is not None:
-        turns = jnp.eye(size, dtype=arms.arm_a.dtype)[:, D:].reshape(1, size, so.A, *[1] * len(batch))
-        turns = jnp.broadcast_to(_as_vectors(turns[0], D), (len(arms.spin), size, D, *batch))
-        J_a, J_b = put(arms.spin, J_a, turns), put(arms.spin, J_b, turns)
-    if arms.jac is not None:
-        points, by_twist = len(arms.a) - len(arms.jac), jax.vmap(lambda jac: _first(jac, D))
-        J_a = jnp.concatenate([J_a[:points], by_twist(arms.jac[:, 0])])
-        J_b = jnp.concatenate([J_b[:points], -by_twist(arms.jac[:, 1])])
+
+    def by_units(arm: Array, side: int) -> Array:  # (C, size, D)
+        J = jax.vmap(lambda arm: _by_units(so, arm))(arm)
+        if arms.spin is not None:
+            turns = jnp.eye(size, dtype=arm.dtype)[:, D:].reshape(1, size, so.A, *[1] * len(batch))
+            J = put(arms.spin, J, jnp.broadcast_to(_as_vectors(turns[0], D), (len(arms.spin), size, D, *batch)))
+        if arms.jac is not None:
+            rows = jax.vmap(lambda jac: _first(jac, D))(arms.jac[:, side])
+            J = jnp.concatenate([J[: len(arms.a) - len(arms.jac)], rows if side == 0 else -rows])
+        return J
+
+    J_a, J_b = by_units(arms.arm_a, 0), by_units(arms.arm_b, 1)
+    mid_a, mid_b = (J_a, J_b) if arms.mid_a is None else (by_units(arm, side) for side, arm in enumerate(mids(arms)))
 
     def answers(J):  # of each contact to unit twists of one of its bodies: impulses
         return jnp.swapaxes(jax.vmap(answer)(jnp.swapaxes(J, 0, 1)), 0, 1)
@@ -189,12 +201,12 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
         return jax.vmap(each)(J, back)
 
     back_a, back_b = answers(J_a), answers(J_b)
-    own = side_sum(block(J_a, back_a), block(J_b, back_b), arms.a, arms.b, moving)
+    own = side_sum(block(mid_a, back_a), block(mid_b, back_b), arms.a, arms.b, moving)
     diagonal = jnp.eye(moving, dtype=own.dtype).reshape(moving, moving, *[1] * (own.ndim - 1))
     whole = diagonal * own[:, None]
     between = between_bodies(*pairs_of(arms.a, arms.b), moving)
     if between is not None:
-        across = [pair_sum(values, arms.a, arms.b) for values in (block(J_a, back_b), block(J_b, back_a))]
+        across = [pair_sum(values, arms.a, arms.b) for values in (block(mid_a, back_b), block(mid_b, back_a))]
         whole = whole - sum_rows(jnp.concatenate(across), between).reshape(whole.shape)
     columns = jnp.moveaxis(whole, (1, 3), (0, 1)).reshape(moving * size, moving, size, *batch)
 

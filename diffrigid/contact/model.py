@@ -12,8 +12,8 @@ needs is skipped. An impact that the sweeps leave over is found late by the next
 and repaired.
 
 A resting contact force is taken as constant since the last impact of the body, a time T before: it
-gives P, so v += P / m and x += (T / 2) P / m, its centroid being in the middle. For a block that slides on a
-floor under Coulomb friction this is exact.
+gives P, so v += P / m and x += (T / 2) P / m, its centroid being in the middle, where it has the arms that the contact
+had then. For a block that slides on a floor under Coulomb friction this is exact; for what tips over, second order.
 """
 
 import functools
@@ -215,10 +215,10 @@ def _apply(
         strikes, law, held_for = with_rows(world, strikes, law, held_for, flight, t, mobility, kick)
         acting = strikes.active.astype(kick.dtype)
         crowd = side_sum(acting, acting, strikes.a, strikes.b, moving)
-        stopped = functools.partial(rolling_stops, mobility)
+        stopped = rolling_stops
     P = solve_impulses(strikes, *law, mobility, crowd, world.contact.rest_speed)
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    early_P = stopped(strikes, P, law, held_for)
+    early_P = stopped(mobility, strikes, P, law, held_for)
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
     kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)

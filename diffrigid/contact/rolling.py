@@ -52,10 +52,11 @@ def with_rows(
     pull = jnp.zeros_like(w) if flight.tau is None else jax.vmap(so.apply)(mobility.inverse_inertia, flight.tau)
     along = jax.vmap(lambda n: unit_vector(n, 0) if flat else n)(strikes.normal[:count])
     none = jnp.zeros_like(along)
+    mid = None if strikes.mid_a is None else none
     rows = Strikes(
         active=strikes.active[:count], s=strikes.s[:count], gap=zero, normal=along, arm_a=none, arm_b=none,
-        K=_mobility_of_turns(mobility, a, b, so), v_rel=kick * turns(w), pull=turns(pull), drift=none,
-        rests=strikes.rests[:count], now=strikes.now[:count], held=strikes.held[:count],
+        mid_a=mid, mid_b=mid, K=_mobility_of_turns(mobility, a, b, so), v_rel=kick * turns(w), pull=turns(pull),
+        drift=none, rests=strikes.rests[:count], now=strikes.now[:count], held=strikes.held[:count],
     )  # fmt: skip
     strikes = replace(
         jax.tree.map(lambda old, new: _behind(count, old, new), replace(strikes, a=(), b=(), jac=None), rows),
@@ -104,7 +105,7 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: tuple, T:
     parts = [(_about, spin * load), (_across, turning(spin, mu) * load)]
     for part, bound in parts[: P.shape[1] - 1]:  # in the plane nothing is across
         slip, end, acting = (part(pair.normal, r) for r in (start, at_end, torque))
-        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound)
+        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound, None)
     return _with_reaction(mobility, strikes, sticks, lost) + _of_slips(mobility, strikes, P, law, T)
 
 
@@ -160,5 +161,5 @@ def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: tuple, T: Arr
 
     free = replace(strikes, v_rel=strikes.v_rel + by_torque, pull=pull, a=(), b=(), jac=None, spin=None)
     a, b = (side[:count] + side[2 * count :] for side in (strikes.a, strikes.b))
-    early = stopping_early(replace(others(free), a=a, b=b), others(P), others(law), others(T))
+    early = stopping_early(mobility, replace(others(free), a=a, b=b), others(P), others(law), others(T))
     return jnp.concatenate([early[:count], jnp.zeros_like(turning(spin, P)), early[count:]])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.contact.cone import put, turning
-from diffrigid.contact.mobility import momentum_changes
+from diffrigid.contact.mobility import Mobility, momentum_changes
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import at_colliders, same_bodies
 from diffrigid.numerics import constant, dot, norm, safe_divide, sum_rows
@@ -24,7 +24,7 @@ def keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array
     jac = None if strikes.jac is None else jnp.zeros_like(strikes.jac)
     if strikes.spin is not None:  # torques displace nothing
         P = put(strikes.spin, P, jnp.zeros_like(turning(strikes.spin, P)))
-    return momentum_changes(replace(strikes, arm_a=drift, arm_b=-drift, jac=jac), P, moving)[1]
+    return momentum_changes(replace(strikes, mid_a=drift, mid_b=-drift, jac=jac), P, moving)[1]
 
 
 def drift_after(strikes: Strikes, dv: Array) -> Array:
@@ -34,7 +34,9 @@ def drift_after(strikes: Strikes, dv: Array) -> Array:
     return strikes.drift + both.reshape(-1, *[1] * (dv.ndim - 1)) * change
 
 
-def stopping_early(strikes: Strikes, P: Array, law: tuple[Array, Array, Array | None], T: Array) -> Array:
+def stopping_early(
+    mobility: Mobility, strikes: Strikes, P: Array, law: tuple[Array, Array, Array | None], T: Array
+) -> Array:
     """What the impulses P, taken as even over T, move too little where the slip stops before: (C, D, *batch) [N s^2].
 
     Friction first stops the slip with all of its bound, then holds against the pull, evenly. Stopping takes the
@@ -52,14 +54,26 @@ def stopping_early(strikes: Strikes, P: Array, law: tuple[Array, Array, Array | 
     slip = at_end - T[:, None] * rubbing(strikes.pull)
     bounds = mu * jax.vmap(dot)(n, P)
     bounds = bounds if most is None else jnp.where(jnp.isfinite(most), most, bounds)
-    return lost_to_stops(strikes, T, slip, at_end, friction, bounds)
+    return lost_to_stops(strikes, T, slip, at_end, friction, bounds, _heaviest(mobility, strikes))
 
 
-def lost_to_stops(strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array) -> Array:
+def _heaviest(mobility: Mobility, strikes: Strikes) -> Array:
+    """What most resists a slip of each contact, (C, *batch) [kg]: the reduced mass, with joints the mass of all."""
+    if mobility.matrix is not None:
+        return jnp.broadcast_to((1.0 / mobility.inverse_mass).sum(0)[None], strikes.s.shape)
+    a, b = (at_colliders(mobility.inverse_mass, side, 0.0) for side in (strikes.a, strikes.b))
+    return 1.0 / (a + b)
+
+
+def lost_to_stops(
+    strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array, heaviest: Array | None
+) -> Array:
     """What impulses `friction` (C, D, *batch) within `bounds` (C, *batch) move too little; see `stopping_early`.
 
     Args:
         slip, at_end: (C, D, *batch) [m/s] at the beginning, and at the end without friction.
+        heaviest: (C, *batch) [kg] what can resist the slip at most. All other friction holds against what does not
+            slip, as that at a corner about which a body turns.
     """
     together = same_bodies(strikes.a, strikes.b)
 
@@ -71,6 +85,9 @@ def lost_to_stops(strikes: Any, T: Array, slip: Array, at_end: Array, friction: 
     own = -jax.vmap(dot)(friction, at_end / jnp.where(at_end_speed > 0, at_end_speed, 1.0)[:, None])
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
+    if heaviest is not None:
+        most = jnp.minimum(size, heaviest * at_end_speed)
+        own, size = own * safe_divide(most, size), most
     creep = max(CREEP, float(jnp.finfo(T.dtype).eps) ** 0.5)
     whole = at_end_speed * bound + size * (speed - along)
     stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0) & (speed > creep)

@@ -8,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.collide import Contacts
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
-from diffrigid.contact.impact import find_impact
+from diffrigid.contact.impact import began, find_impact
 from diffrigid.contact.impulse import effective_matrix, restitution_at
+from diffrigid.contact.levers import acceleration, levers, with_rates
 from diffrigid.contact.order import Meeting, in_order
 from diffrigid.contact.resting import Strikes, are_alone
-from diffrigid.contact.sides import Placed, Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
+from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
 from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
@@ -42,13 +44,14 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     meetings = in_order(meetings, a, b, hang_together, flight.t0, dt, at_end, bounces)
     parts, jac = [], None
     for sides, meeting in zip(groups, meetings, strict=False):
-        each = jax.vmap(lambda a, b, meeting: strikes_of(a, b, meeting, dt))
+        each = jax.vmap(lambda a, b, meeting: strikes_of(a, b, meeting, dt, is_loaded(world)))
         part = apart(opaque_true(dt), each, *sides, meeting)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1])
         jac = stops.jac
-        parts.append(replace(stops, jac=None))
+        mid = stops.arm_a if is_loaded(world) else None
+        parts.append(replace(stops, jac=None, mid_a=mid, mid_b=mid))
     if len(parts) > 1:
         strikes = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
     else:
@@ -65,6 +68,11 @@ def waits(world: Any) -> bool:
     return not all(drives) and (any(drives) or (bool(world.forces) and not alone))
 
 
+def is_loaded(world: Any) -> bool:
+    """Whether what rests carries a load: something pulls at it. Static."""
+    return bool(world.forces) or any(driven(world))
+
+
 def meet(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
     """The next impact of one pair, or the end of the step where `at_end` (a bool)."""
     straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
@@ -74,44 +82,37 @@ def meet(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | 
 def next_strikes(world: Any, a: Side, b: Side, dt: Array) -> Strikes:
     """The contacts of one pair at its next exact impact, (K, ...)."""
     meeting, never = meet(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
-    return strikes_of(a, b, replace(meeting, now=meeting.fast, joins=never, held=never), dt)
+    return strikes_of(a, b, replace(meeting, now=meeting.fast, joins=never, held=never), dt, False)
 
 
-def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array) -> Strikes:
-    """The contacts of one pair, (K, ...); see `find_strikes`.
-
-    A resting force acts evenly over the time since the last impact, so its impulse at the middle of that. There
-    the bodies were elsewhere: the arms are those to one point that both had then, which keeps angular momentum.
-    On a static the body did not fall through the surface: its arm is to its own surface, not to the middle of a gap.
-    """
-    both_move, s, held = a.flight is not None and b.flight is not None, meeting.s, meeting.held
-    live = opaque_true(dt)
+def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array, loaded: bool) -> Strikes:
+    """The contacts of one pair, (K, ...); see `find_strikes`. They are `loaded` if forces act in this world."""
+    s, held, live = meeting.s, meeting.held, opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
-    contacts = contacts_of(a, at_a, b, at_b)
+    contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
     # Those too that the next of a pile fell away from, which may close again once that is held, or struck.
     opened = jnp.where(held | meeting.joins, dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None), 0.0)
     near = contacts.gap <= (meeting.level + meeting.slack + opened)[None]
     active = (near | (meeting.rests & held[None])) & meeting.hit[None]
-    drift = jnp.zeros_like(at_a.x)
-    if both_move:
-        drift = 0.5 * (at_a.v - at_b.v)  # type: ignore[operator]
-        lasted = jnp.where(held, 0.5 * (s - jnp.maximum(a.flight.t0, b.flight.t0)), 0.0)
-        mid_shift = lasted[None] * drift
+    both_move = a.flight is not None and b.flight is not None
+    drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
+    T = jnp.where(held, s - began(a, b), 0.0)
 
-    def each(normal, point, gap):
-        shift = mid_shift if both_move else jnp.where(held, 0.5 * gap, 0.0)[None] * normal
-        arm_a, arm_b = point - at_a.x + shift, point - at_b.x - shift
-        pulls = [_acceleration(side, at, s, arm) for side, at, arm in ((a, at_a, arm_a), (b, at_b, arm_b))]
+    def each(contact: Contacts, moving: Contacts | None) -> Strikes:
+        gap = contact.gap
+        lever = levers(replace(contact, gap=jnp.where(held, gap, 0.0)), moving, at_a, at_b, drift, T)
+        arms = (a, at_a, lever.arm_a), (b, at_b, lever.arm_b)
+        pulls: list[Any] = [acceleration(side, at, s, arm, lever.rate) for side, at, arm in arms]
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
         touching = (gap > 0) & (gap <= meeting.slack)  # open by no more than rounding
         return Strikes(
-            active=gap < 0, s=s, gap=jnp.where(touching, 0.0, gap), normal=normal, arm_a=arm_a, arm_b=arm_b,
-            K=effective_matrix(at_a, arm_a, at_b, arm_b), v_rel=relative_velocity(at_a, arm_a, at_b, arm_b),
-            pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
+            active=gap < 0, s=s, gap=jnp.where(touching, 0.0, gap), normal=contact.normal, arm_a=lever.arm_a,
+            arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, K=effective_matrix(at_a, at_b, lever),
+            v_rel=relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b), pull=pull, drift=drift, rests=gap < 0,
+            now=meeting.now, held=held,
         )  # fmt: skip
 
-    strikes = jax.vmap(each)(contacts.normal, contacts.point, contacts.gap)
-    return replace(strikes, active=active, rests=meeting.rests)
+    return replace(jax.vmap(each)(contacts, moving), active=active, rests=meeting.rests)
 
 
 def relative_path_is_straight(world: Any, both_move: bool) -> bool:
@@ -161,20 +162,6 @@ def ends(world: Any) -> dict[str, tuple[int, ...]]:
 
     a, b = column(lambda pairs: pairs.a), column(lambda pairs: pairs.b)
     return {"a": a + stop_ends(world, "a"), "b": b + stop_ends(world, "b")}
-
-
-def _acceleration(side: Side, at: Placed, s: Array, arm: Array) -> Array | None:
-    """Of a point of a collider from its anchor to s, (D, *batch) [m/s^2], in the mean, by forces and torques on it."""
-    f = side.flight
-    if f is None:
-        return None
-    half = 0.5 * (s - f.t0)[None]
-    a = f.a if f.jolt is None else f.a + half * f.jolt
-    if f.tau is None:
-        return a
-    so = rotations(f.dim)
-    tau = f.tau if f.twist is None else f.tau + half * f.twist
-    return a + so.cross(so.apply(at.inverse_inertia, tau), arm)
 
 
 @pytree

@@ -1,0 +1,93 @@
+"""Where a contact acts on its two bodies: at the end of the time that it is held for, and in the middle of it.
+
+A resting force acts evenly over that time T, so its impulse at the middle. There the bodies and their contact were
+elsewhere, at p - (T/2) p' and x - (T/2) v: impulses have the arms of the middle, which keeps angular momentum, and
+what they have to hold is the velocity at the arms of the end. With both at the end, what tips over is of first order.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid.collide import Contacts
+from diffrigid.contact.sides import Placed, Side, contacts_of
+from diffrigid.numerics import apart, dot, safe_divide
+from diffrigid.pytree import array, pytree
+from diffrigid.state import rotations
+
+
+@pytree
+class Levers:
+    """Arms of one contact from the centres of mass of a and b, (D, *batch) [m], world axes."""
+
+    arm_a: Array = array("D")  # at the end
+    arm_b: Array = array("D")
+    mid_a: Any = array("D", default=None)  # in the middle; None: the same
+    mid_b: Any = array("D", default=None)
+    rate: Any = array("D", default=None)  # [m/s] of the point of contact; None: not known
+
+
+def levers(contact: Contacts, moving: Contacts | None, at_a: Placed, at_b: Placed, drift: Array, T: Array) -> Levers:
+    """Levers of one contact.
+
+    Args:
+        contact: one of a pair, with the gap that it has closed by while it was held, else 0.
+        moving: its rates. None: all arms are those in the middle, of a point that moves as the centres do in the mean.
+        drift: (D, *batch) [m/s] half the velocity of a against b, of the centres; 0 at a static.
+        T: (*batch) [s] for which it is held, else 0.
+    """
+    normal, point, gap = contact.normal, contact.point, contact.gap
+    inside = 0.5 * gap[None] * normal
+    ends = point - at_a.x + inside, point - at_b.x - inside
+    both_move, half = at_a.v is not None and at_b.v is not None, 0.5 * T[None]
+    # Against a static, arms are to a body's own surface, not to the middle of a gap: it did not fall through it.
+    mids = (point - at_a.x + half * drift, point - at_b.x - half * drift) if both_move else ends
+    if moving is None:
+        return Levers(arm_a=mids[0], arm_b=mids[1])
+    sign = 0.0 if both_move else 1.0 if at_b.v is None else -1.0
+    rate = moving.point + 0.5 * sign * moving.gap[None] * normal
+    turned = half * (rate - (at_b.v if at_a.v is None else at_a.v - drift))
+    size: Any = sum(dot(arm, arm) for arm, at in zip(ends, (at_a, at_b), strict=True) if at.v is not None)
+    # No further than arms are long: what turns faster than steps resolve is not to turn them around.
+    turned = safe_divide(size, size + 4.0 * dot(turned, turned))[None] * turned
+    return Levers(arm_a=ends[0], arm_b=ends[1], mid_a=mids[0] - turned, mid_b=mids[1] - turned, rate=rate)
+
+
+def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tuple[Contacts, Contacts]:
+    """The contacts of a pair, and their rates: how the surfaces move where they meet. For `live` see `apart`."""
+    so = rotations(at_a.x.shape[0])
+    poses = [(at.x, at.q) for at in (at_a, at_b)]
+    rates = [
+        tuple(map(jnp.zeros_like, pose)) if at.v is None else (at.v, apart(live, so.rate, at.w, at.q))
+        for at, pose in zip((at_a, at_b), poses, strict=True)
+    ]
+
+    def moved(a: Side, b: Side, poses: list, rates: list) -> tuple[Contacts, Contacts]:
+        def placed(*poses: tuple) -> Contacts:
+            at_a, at_b = (Placed(x=x, q=q) for x, q in poses)
+            return contacts_of(a, at_a, b, at_b)
+
+        return jax.jvp(placed, tuple(poses), tuple(rates))
+
+    return apart(live, moved, a, b, poses, rates)
+
+
+def acceleration(side: Side, at: Placed, s: Array, arm: Array, rate: Array | None) -> Array | None:
+    """Of a collider where its contact is, from its anchor to s, (D, *batch) [m/s^2], in the mean.
+
+    Args:
+        rate: (D, *batch) [m/s] velocity of the point of contact; None: as that of the centre.
+    """
+    f = side.flight
+    if f is None:
+        return None
+    so, half = rotations(f.dim), 0.5 * (s - f.t0)[None]
+    a = f.a if f.jolt is None else f.a + half * f.jolt
+    if rate is not None:
+        a = a + so.cross(at.w, rate - at.v)
+    if f.tau is None:
+        return a
+    tau = f.tau if f.twist is None else f.tau + half * f.twist
+    return a + so.cross(so.apply(at.inverse_inertia, tau), arm)
