@@ -17,8 +17,8 @@ from jax import Array, lax
 from diffrigid.contact.cone import Cone
 from diffrigid.contact.impulse import within_energy
 from diffrigid.contact.mobility import Arms, Mobility, moved
-from diffrigid.contact.order import hanging_together
-from diffrigid.contact.sides import at_colliders, at_pairs, pair_sum, pairs_of
+from diffrigid.contact.order import Links, hanging_together
+from diffrigid.contact.sides import at_pairs, pair_sum, pairs_of
 from diffrigid.contact.together import solve_together
 from diffrigid.numerics import dot, some
 from diffrigid.pytree import replace
@@ -63,12 +63,12 @@ def solve_without_gain(cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility)
 
 def _summed(cone: Cone, arms: Arms, mobility: Mobility, *values: Array) -> list[Array]:
     """Sums of values (C, *batch) over all contacts that hang together with each of them, each (C, *batch)."""
-    moving, (a, b) = mobility.inverse_mass.shape[0], pairs_of(arms.a, arms.b)
+    moving = mobility.inverse_mass.shape[0]
     by_pair = pair_sum(jnp.stack([cone.on, *values], axis=1), arms.a, arms.b)
     number = lax.broadcasted_iota(jnp.int32, (moving, *by_pair.shape[2:]), 0)
     if mobility.matrix is None:
-        body = hanging_together(by_pair[:, 0] > 0, a, b, tuple((i,) for i in range(moving)))
-        label = jnp.minimum(at_colliders(body, a, moving), at_colliders(body, b, moving))
+        links = Links(*pairs_of(arms.a, arms.b), tuple((i,) for i in range(moving)))
+        label = links.least(hanging_together(by_pair[:, 0] > 0, links), moving)
     else:  # joints may hold all of them together
         label = jnp.zeros(by_pair[:, 0].shape, jnp.int32)
     member = (label[None] == number[:, None]).astype(by_pair.dtype)

@@ -94,7 +94,7 @@ class Contact:
     def _passes(self, world: Any, start: Anchors, launch: Callable, dt: Array, near: Array) -> Anchors:
         """The anchors after all passes; there are none unless some pair is `near`, a bool."""
         always = driven(world)  # what acts in every step, and needs no impact before
-        resting = jnp.broadcast_to(_rows_of(always, start.t0), (len(always), *start.t0.shape[1:]))
+        resting = jnp.broadcast_to(_flags(always, start.t0), (len(always), *start.t0.shape[1:]))
 
         # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches.
         @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
@@ -139,7 +139,7 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
     restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
-    drives = _rows_of(driven(world), dt[None])
+    drives = _flags(driven(world), dt[None])
     u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
     if world.bodies.restitution_falloff is not None:
         restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
@@ -171,7 +171,7 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, some(resting | strikes.rests)
 
 
-def _rows_of(flags: tuple[bool, ...], like: Array) -> Array:
+def _flags(flags: tuple[bool, ...], like: Array) -> Array:
     """Flags of contacts as an array with the batch axes of `like`, (C, 1, ...)."""
     return jnp.asarray(constant(flags, "bool")).reshape(len(flags), *[1] * (like.ndim - 1))
 

@@ -7,7 +7,7 @@ the next it would never end. With restitution it is passed on (Newton's cradle).
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -34,15 +34,32 @@ class Meeting:
     held: Any = array(default=None)  # bool: s is the time until which what rests is held
 
 
+class Links(NamedTuple):
+    """What may act on what: M links between two colliders, and the joints of N bodies."""
+
+    a: tuple[int, ...]  # colliders of each link: bodies, then statics
+    b: tuple[int, ...]
+    islands: tuple[tuple[int, ...], ...]  # for each body, those that hang together with it by joints, itself included
+
+    def of_bodies(self, reduce: Callable, values: Array, none: Any) -> Array:
+        """Values (M, *batch) of the links reduced for each body, (N, *batch); `none` if it has no links."""
+        padded = jnp.concatenate([values, values, jnp.full_like(values[:1], none)])
+        sides = body_sides(self.a, self.b, len(self.islands))
+        return over_islands(reduce, reduce(rows(padded, sides), axis=1), self.islands, none)
+
+    def least(self, of_bodies: Array, still: Any) -> Array:
+        """Of the values (N, *batch) of the two bodies of each link, (M, *batch); `still` is that of a static."""
+        return jnp.minimum(at_colliders(of_bodies, self.a, still), at_colliders(of_bodies, self.b, still))
+
+
 def in_order(
-    meetings: list[Meeting], a: tuple[int, ...], b: tuple[int, ...], islands: tuple, t0: Array, dt: Array,
-    at_end: Array, bounces: Array | None,
-) -> list[Meeting]:  # fmt: skip
+    meetings: list[Meeting], links: Links, t0: Array, dt: Array, at_end: Array, bounces: Array | None
+) -> list[Meeting]:
     """Whose turn it is: the meetings with `now` and `held`.
 
     Args:
-        meetings: between colliders a and b, M in all.
-        islands: for each of N bodies, those that hang together with it by joints. An impact reaches all of them.
+        meetings: of the links, M in all.
+        links: an impact reaches all bodies that hang together by joints.
         t0: (N, *batch) [s] where their paths begin.
         at_end: bool; True: all are at the end of the step.
         bounces: (M, *batch) bool: there is restitution between them. None: no bodies have to be held until an impact.
@@ -53,24 +70,21 @@ def in_order(
     tie = jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt[None]
 
     def first_of(impacts: Array) -> Array:
-        return _of_bodies(jnp.min, jnp.where(impacts, s, jnp.inf), a, b, islands, jnp.inf)
-
-    def earliest(of_bodies: Array) -> Array:
-        return jnp.minimum(at_colliders(of_bodies, a, jnp.inf), at_colliders(of_bodies, b, jnp.inf))
+        return links.of_bodies(jnp.min, jnp.where(impacts, s, jnp.inf), jnp.inf)
 
     first = first_of(fast)
-    now, held = jnp.abs(lax.stop_gradient(s - earliest(first))) <= tie, jnp.broadcast_to(at_end, s.shape)
+    now, held = jnp.abs(lax.stop_gradient(s - links.least(first, jnp.inf))) <= tie, jnp.broadcast_to(at_end, s.shape)
     joins = jnp.zeros_like(now)
     if bounces is not None:
 
         def of_clusters(first: Array, first_bounce: Array) -> tuple[Array, Array]:
-            return _of_clusters(first, first_bounce, rests, a, b, islands, t0, dt)
+            return _of_clusters(first, first_bounce, rests, links, t0, dt)
 
         def free(first: Array, _: Array) -> tuple[Array, Array]:
             return (jnp.full_like(first, jnp.inf),) * 2
 
         of_both = lax.cond(some(rests) & some(fast), of_clusters, free, first, first_of(fast & bounces))
-        until, along = map(earliest, of_both)
+        until, along = (links.least(of_bodies, jnp.inf) for of_bodies in of_both)
         waits, joins = until < jnp.inf, (rests | now) & ~bounces & (along < jnp.inf)
         now, held = (now & ~waits) | joins, held | (waits & rests)
         s = jnp.where(waits & rests, until, jnp.where(joins, along, s))
@@ -85,51 +99,42 @@ def in_order(
     return ordered
 
 
-def hanging_together(on: Array, a: tuple[int, ...], b: tuple[int, ...], islands: tuple) -> Array:
+def hanging_together(on: Array, links: Links) -> Array:
     """For each of N bodies the least of those that it hangs together with, (N, *batch) int.
 
     Args:
-        on: (M, *batch) bool: colliders a and b do. Statics hold nothing together.
+        on: (M, *batch) bool: the two of a link do. Statics hold nothing together.
     """
-    moving = len(islands)
+    moving = len(links.islands)
     number = lax.broadcasted_iota(jnp.int32, (moving, *on.shape[1:]), 0)
 
     def spread(carry: tuple) -> tuple:
         label, _ = carry
-        least = jnp.minimum(at_colliders(label, a, moving), at_colliders(label, b, moving))
-        least = jnp.minimum(label, _of_bodies(jnp.min, jnp.where(on, least, moving), a, b, islands, moving))
+        least = jnp.where(on, links.least(label, moving), moving)
+        least = jnp.minimum(label, links.of_bodies(jnp.min, least, moving))
         return least, some(least < label)
 
     return lax.while_loop(lambda carry: carry[1], spread, (number, jnp.asarray(True)))[0]
 
 
 def _of_clusters(
-    first: Array, first_bounce: Array, rests: Array, a: tuple[int, ...], b: tuple[int, ...], islands: tuple, t0: Array,
-    dt: Array,
-) -> tuple[Array, Array]:  # fmt: skip
+    first: Array, first_bounce: Array, rests: Array, links: Links, t0: Array, dt: Array
+) -> tuple[Array, Array]:
     """Until when each body is held, and when it takes part in an impact without restitution; (N, *batch) [s].
 
     Infinity: it is not, or does not.
 
     Args:
         first, first_bounce: (N, *batch) [s] its own next impact, and that with restitution.
-        rests: (M, *batch) bool: colliders a and b touch.
+        rests: (M, *batch) bool: the two of a link touch.
     """
-    label = hanging_together(rests, a, b, islands)
+    label = hanging_together(rests, links)
     member = label[None] == label[:, None]
     until, bounce, begins = (jnp.where(member, t[None], jnp.inf).min(1) for t in (first, first_bounce, t0))
-    supported = (member & _of_bodies(jnp.max, rests, a, b, islands, False)[None]).any(1) & (until < jnp.inf)
+    supported = (member & links.of_bodies(jnp.max, rests, False)[None]).any(1) & (until < jnp.inf)
     waits = until - begins > SOON * dt[None]
     held, along = supported & waits, supported & ~waits & (until < bounce)
     return jnp.where(held, until, jnp.inf), jnp.where(along, until, jnp.inf)
-
-
-def _of_bodies(
-    reduce: Callable, values: Array, a: tuple[int, ...], b: tuple[int, ...], islands: tuple, none: Any
-) -> Array:
-    """Values (M, *batch) between colliders a and b reduced for each body, (N, *batch); `none` if there are none."""
-    padded = jnp.concatenate([values, values, jnp.full_like(values[:1], none)])
-    return over_islands(reduce, reduce(rows(padded, body_sides(a, b, len(islands))), axis=1), islands, none)
 
 
 def over_islands(reduce: Callable, values: Array, islands: tuple, none: Any) -> Array:

@@ -90,6 +90,21 @@ def centre(side: Side, s: Array) -> tuple[Array, Array]:
     return position(side.flight, s), velocity(side.flight, s)
 
 
+def earliest(a: Side, b: Side) -> tuple[Array, Array]:
+    """Time from which both paths hold, and how far back a late impact may be repaired."""
+    start = began(a, b)
+    if b.flight is None or a.flight is None:
+        return start, (a if b.flight is None else b).since
+    return start, jnp.maximum(a.since, b.since)
+
+
+def began(a: Side, b: Side) -> Array:
+    """Time from which both paths hold, (*batch) [s]."""
+    if b.flight is None or a.flight is None:
+        return (a if b.flight is None else b).flight.t0
+    return jnp.maximum(a.flight.t0, b.flight.t0)
+
+
 def contacts_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
     """Contacts of the pair where its colliders are placed."""
     return COLLIDERS[type(a.shape), type(b.shape)](a.shape, *_origin(a, at_a), b.shape, *_origin(b, at_b))

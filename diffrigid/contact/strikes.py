@@ -11,12 +11,12 @@ from jax import Array, lax
 from diffrigid.collide import Contacts
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
-from diffrigid.contact.impact import began, find_impact
+from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix, restitution_at
 from diffrigid.contact.levers import acceleration, levers, with_rates
-from diffrigid.contact.order import Meeting, in_order
+from diffrigid.contact.order import Links, Meeting, in_order
 from diffrigid.contact.resting import Strikes, are_alone
-from diffrigid.contact.sides import Side, centre, contacts_of, place, reach_of, relative_velocity, sides_of
+from diffrigid.contact.sides import Side, began, centre, contacts_of, place, reach_of, relative_velocity, sides_of
 from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
@@ -34,14 +34,14 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     """
     width = world.contact.width
     groups = [sides_of(world, pairs, flight, since) for pairs in world.pairs]
-    meetings = [jax.vmap(lambda a, b: meet(world, a, b, dt, at_end, width))(*sides) for sides in groups]
+    meetings = [jax.vmap(lambda a, b: next_meeting(world, a, b, dt, at_end, width))(*sides) for sides in groups]
     if stops_of(world):
         meetings.append(meet_stops(world, flight, since, dt, at_end))
     a, b = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
-    hang_together = islands(world.joints, len(world.names))
     bounces = _coefficients(world, "restitution", a, b, dt.shape) > 0 if waits(world) else None
     a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
-    meetings = in_order(meetings, a, b, hang_together, flight.t0, dt, at_end, bounces)
+    links = Links(a, b, islands(world.joints, len(world.names)))
+    meetings = in_order(meetings, links, flight.t0, dt, at_end, bounces)
     parts, jac = [], None
     for sides, meeting in zip(groups, meetings, strict=False):
         each = jax.vmap(lambda a, b, meeting: strikes_of(a, b, meeting, dt, is_loaded(world)))
@@ -73,7 +73,7 @@ def is_loaded(world: Any) -> bool:
     return bool(world.forces) or any(driven(world))
 
 
-def meet(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
+def next_meeting(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
     """The next impact of one pair, or the end of the step where `at_end` (a bool)."""
     straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
     return find_impact(a, b, dt, width, straight, world.contact.rest_speed, at_end)
@@ -81,7 +81,7 @@ def meet(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | 
 
 def next_strikes(world: Any, a: Side, b: Side, dt: Array) -> Strikes:
     """The contacts of one pair at its next exact impact, (K, ...)."""
-    meeting, never = meet(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
+    meeting, never = next_meeting(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
     return strikes_of(a, b, replace(meeting, now=meeting.fast, joins=never, held=never), dt, False)
 
 
