@@ -1,6 +1,6 @@
 """How many world-steps a second does one core reach beside pymunk and Box2D, and what does a gradient cost?
 
-    python experiments/throughput.py [--scenes S1,S2] [--out FILE] [--core N]
+    python experiments/throughput.py [--scenes S1,S2] [--forward] [--runs 5] [--out FILE] [--core N]
 
 One core; each case in a process of its own, so that compile time and peak memory are its own. A world-step is
 one step of one world, whatever its sub-steps. The native engines (pyb2d3 is Box2D v3) step their worlds in
@@ -32,20 +32,22 @@ from pathlib import Path
 
 from bench_scenes import PEERS, SCENES, build_diffrigid
 
-RUNS, MIN_SECONDS = 5, 1.0  # a median is over at least this many runs and this much time, after a warm-up
+MIN_SECONDS = 1.0  # a median is over at least so much time, after a warm-up
 PEER_WORLDS, PEER_BODIES = 32, 1024  # worlds in a timed run, but no more than so many bodies; Box2D holds 128 worlds
 HEADER = "scene engine    worlds  steps/s over peer | compile s  gradient | grad/fwd temp MB | sanity"
 ROW = "{rate:8.3g} {over_peer:9.3g} | {compile_s:9.2f} {grad_compile_s:9.2f} | "
 ROW += "{grad_over_forward:8.2f} {grad_temp_mb:7.0f} | "
 
 
-def peer_rate(engine, scenes):
+def peer_rate(engine, scenes, runs):
     build, run, read = PEERS[engine]
-    ends, row = timed(lambda worlds: [run(w, scenes[0]) for w in worlds], prepare=lambda: [build(s) for s in scenes])
+    ends, row = timed(
+        runs, lambda worlds: [run(w, scenes[0]) for w in worlds], prepare=lambda: [build(s) for s in scenes]
+    )
     return row | {"sanity": scenes[0].check(*read(ends[0]))}
 
 
-def diffrigid_rate(scenes):
+def diffrigid_rate(scenes, runs, forward):
     import jax
     import jax.numpy as jnp
 
@@ -58,37 +60,39 @@ def diffrigid_rate(scenes):
     def roll(v, world, states):
         return dr.rollout_batch(world, replace(states, v=v), dt=scenes[0].dt, steps=scenes[0].steps, final_only=True)
 
-    loss = jax.value_and_grad(lambda *args: jnp.sum(roll(*args).x ** 2))
-    end, row = timed_jit(roll, v, world, states)
+    end, row = timed_jit(runs, roll, v, world, states)
+    sanity = scenes[0].check(end.x[0].tolist(), end.v[0].tolist()) | {"dtype": str(end.x.dtype)}
+    if forward:
+        return row | {"sanity": sanity}
     jax.clear_caches()  # what was traced for the forward run must not shorten the gradient's compile time
-    (_, grad), grad_row = timed_jit(loss, v, world, states)
-    sanity = scenes[0].check(end.x[0].tolist(), end.v[0].tolist())
-    sanity |= {"dtype": str(end.x.dtype), "grad_finite": bool(jnp.isfinite(grad).all())}
+    loss = jax.value_and_grad(lambda *args: jnp.sum(roll(*args).x ** 2))
+    (_, grad), grad_row = timed_jit(runs, loss, v, world, states)
+    sanity |= {"grad_finite": bool(jnp.isfinite(grad).all())}
     row |= {f"grad_{key}": value for key, value in grad_row.items()}
     return row | {"grad_over_forward": row["grad_seconds"] / row["seconds"], "sanity": sanity}
 
 
-def timed_jit(function, *args):
+def timed_jit(runs, function, *args):
     import jax
 
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*args).compile()
     seconds = time.perf_counter() - start
-    result, row = timed(lambda _: jax.block_until_ready(compiled(*args)))
+    result, row = timed(runs, lambda _: jax.block_until_ready(compiled(*args)))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # [MB] on Linux, kB on macOS
     temporaries = compiled.memory_analysis().temp_size_in_bytes / 1e6
     return result, row | {"compile_s": seconds, "peak_rss_mb": peak, "temp_mb": temporaries}
 
 
-def timed(run, prepare=lambda: None):
+def timed(runs, run, prepare=lambda: None):
     """A result of run(prepare()); median time (of run alone) and the distance of the quartiles over it."""
     result, times = run(prepare()), []
-    while len(times) < RUNS or sum(times) < MIN_SECONDS:
+    while len(times) < runs or sum(times) < MIN_SECONDS:
         argument = prepare()
         start = time.perf_counter()
         run(argument)
         times.append(time.perf_counter() - start)
-    low, median, high = statistics.quantiles(times, n=4, method="inclusive")
+    low, median, high = statistics.quantiles(times, n=4, method="inclusive") if len(times) > 1 else times * 3
     return result, {"seconds": median, "quartile_spread": (high - low) / median, "runs": len(times)}
 
 
@@ -97,7 +101,8 @@ def run_case(case):
     importlib.import_module(case["engine"])
     case["import_s"] = time.perf_counter() - start
     scenes = [SCENES[case["scene"]](world) for world in range(case["worlds"])]
-    case |= peer_rate(case["engine"], scenes) if case["engine"] in PEERS else diffrigid_rate(scenes)
+    engine, runs = case["engine"], case["runs"]
+    case |= peer_rate(engine, scenes, runs) if engine in PEERS else diffrigid_rate(scenes, runs, case["forward"])
     return case | {"rate": len(scenes) * scenes[0].steps / case["seconds"]}
 
 
@@ -114,11 +119,12 @@ def run_in_process(case):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def measure(name):
+def measure(name, runs, forward):
     best, rows, scene = 0.0, [], SCENES[name](0)
     peer_worlds = min(PEER_WORLDS, -(-PEER_BODIES // len(scene.x)))
     for engine, worlds in [(peer, peer_worlds) for peer in scene.peers] + [("diffrigid", n) for n in scene.worlds]:
-        row = run_in_process({"scene": name, "engine": engine, "worlds": worlds})
+        case = {"scene": name, "engine": engine, "worlds": worlds, "runs": runs, "forward": forward}
+        row = run_in_process(case)
         if engine in PEERS:
             best = max(best, row.get("rate", 0.0))
         elif best and "rate" in row:
@@ -143,6 +149,8 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    parser.add_argument("--forward", action="store_true", help="no gradients")
+    parser.add_argument("--runs", type=int, default=5, help="the least in a median")
     parser.add_argument("--core", type=int, help="core to pin to; the last one unless told")
     parser.add_argument("--case", type=json.loads, help=argparse.SUPPRESS)  # one case, in this process
     args = parser.parse_args()
@@ -152,7 +160,7 @@ def main():
         args.core = max(os.sched_getaffinity(0)) if args.core is None else args.core
         os.sched_setaffinity(0, {args.core})
     print(HEADER)
-    rows = [row for name in args.scenes.split(",") for row in measure(name)]
+    rows = [row for name in args.scenes.split(",") for row in measure(name, args.runs, args.forward)]
     args.out.write_text(json.dumps(machine() | {"core": args.core, "cases": rows}, indent=1) + "\n")
 
 

@@ -251,7 +251,7 @@ def test_friction_of_rounding_has_finite_slopes():
     pair = SimpleNamespace(a=(0,), b=(1,), active=jnp.array([True]))
     slip, at_end, friction = (jnp.full((1, 2), size, jnp.float32) for size in (1e-3, 0.9e-3, 1e-16))
     arguments = jnp.full(1, 4e-3, jnp.float32), slip, at_end, friction, jnp.zeros(1, jnp.float32)
-    lost, back = jax.vjp(functools.partial(lost_to_stops, pair, heaviest=jnp.ones(1, jnp.float32)), *arguments)
+    lost, back = jax.vjp(functools.partial(lost_to_stops, pair, most_to_stop=jnp.ones(1, jnp.float32)), *arguments)
     assert not lost.any()
     assert all(np.isfinite(slope).all() for slope in back(jnp.ones_like(lost)))
 

@@ -130,31 +130,35 @@ def test_a_box_tips_over_its_corner():
         assert_allclose(slopes, jax.jacfwd(tipping_in_theory, (1, 2))(*p), atol=slope)
 
 
-def test_a_block_slides_into_another():
-    """Both rub on the floor until they meet within a step, and from then on: places and slopes of closed form."""
-    sliding, steps = 0.75, 45
+def slides_into(p, dim):
+    """Places at rest, (2,) [m], of a block that slides into another; both rub on the floor."""
+    along, up = jnp.eye(dim)[0], jnp.eye(dim)[-1]
+    box, sliding, steps = dr.Box(half=(0.1,) * dim), 0.75, 45
+    bodies = {
+        "block": dr.Body(box, mass=1.0, x=0.1 * up, v=p["v"] * along),
+        "other": dr.Body(box, mass=p["m"], x=0.1 * up + (0.2 + p["way"]) * along),
+        "floor": dr.Static(dr.HalfSpace(normal=up), restitution=0.0),
+    }
+    world, state = dr.scene(bodies, gravity=-G * up, friction=p["mu"], restitution=p["e"])
+    return dr.rollout(world, state, dt=sliding / steps, steps=steps).state.x[-1, :, 0]
 
-    def at_end(p):
-        side, box = 0.2, dr.Box(half=(0.1, 0.1))
-        bodies = {
-            "block": dr.Body(box, mass=1.0, x=(0.0, 0.1), v=jnp.stack([p["v"], 0.0 * p["v"]])),
-            "other": dr.Body(box, mass=p["m"], x=jnp.stack([side + p["way"], 0.1 + 0.0 * p["v"]])),
-            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)), restitution=0.0),
-        }
-        world, state = dr.scene(bodies, gravity=(0.0, -G), friction=p["mu"], restitution=p["e"])
-        return dr.rollout(world, state, dt=sliding / steps, steps=steps).state.x[-1, :, 0]
 
-    def expected(p):
-        brake = p["mu"] * G
-        v = jnp.sqrt(p["v"] ** 2 - 2 * brake * p["way"])
-        after = v / (1 + p["m"]) * jnp.stack([1 - p["e"] * p["m"], 1 + p["e"]])
-        return p["way"] + jnp.array([0.0, 0.2]) + after * jnp.abs(after) / (2 * brake)
+def slides_into_in_closed_form(p):
+    brake = p["mu"] * G
+    v = jnp.sqrt(p["v"] ** 2 - 2 * brake * p["way"])
+    after = v / (1 + p["m"]) * jnp.stack([1 - p["e"] * p["m"], 1 + p["e"]])
+    return p["way"] + jnp.array([0.0, 0.2]) + after * jnp.abs(after) / (2 * brake)
 
+
+@pytest.mark.parametrize(
+    ("dim", "mode"), [(2, jax.jacfwd), *(pytest.param(d, jax.jacrev, marks=pytest.mark.slow) for d in (2, 3))]
+)
+def test_a_block_slides_into_another(dim, mode):
+    """They meet within a step: places and slopes of closed form."""
     p = jax.tree.map(jnp.asarray, {"v": 1.6, "m": 0.5, "way": 0.13, "mu": 0.3, "e": 0.6})
-    places, slopes = jax.jit(with_slopes(at_end, jax.jacfwd))(p)
-    assert_allclose(places, expected(p), atol=1e-7)
-    true_slopes = jax.jacfwd(expected)(p)
-    for name, true_slope in true_slopes.items():
+    places, slopes = jax.jit(with_slopes(lambda p: slides_into(p, dim), mode))(p)
+    assert_allclose(places, slides_into_in_closed_form(p), atol=1e-7)
+    for name, true_slope in jax.jacfwd(slides_into_in_closed_form)(p).items():
         assert_allclose(slopes[0][name], true_slope, atol=1e-4)  # both stop within a step
 
 

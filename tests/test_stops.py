@@ -175,3 +175,26 @@ def test_a_batch_in_single_precision():
 def test_mistakes_are_named(along, message):
     with pytest.raises(ValueError, match=message):
         wheel(1.0, **along)
+
+
+def test_friction_turns_back_with_the_motion():
+    """A slider on a spring, with dry friction: each half of a swing is one of cosine about F / k, and loses 2 F / k."""
+    t, rate = 1.4, 240
+
+    def place(k, F, x):
+        body = dr.Body(None, mass=1.0, inertia=1.0, x=jnp.stack([x, 0.0 * x]))
+        spring = dr.SpringDamper(a="body", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=k)
+        slider = dr.Prismatic("body", None, axis_b=(1.0, 0.0), friction=F)
+        world, state = dr.scene({"body": body}, forces=[spring], joints=[slider])
+        return dr.rollout(world, state, dt=1 / rate, steps=round(t * rate)).state.x[-1, 0, 0]
+
+    def expected(k, F, x):
+        w = jnp.sqrt(k)
+        half = jnp.floor(t * w / jnp.pi)
+        swing = (x - (2.0 * half + 1.0) * F / k) * jnp.cos(t * w - half * jnp.pi) + F / k
+        return (-1.0) ** half * swing
+
+    p = tuple(map(jnp.asarray, (40.0, 2.0, 1.0)))
+    value, slopes = jax.value_and_grad(place, (0, 1, 2))(*p)
+    assert_allclose(value, expected(*p), atol=5e-5)
+    assert_allclose(slopes, jax.grad(expected, (0, 1, 2))(*p), atol=5e-5)

@@ -33,7 +33,7 @@ from diffrigid.contact.order import over_islands
 from diffrigid.contact.resting import Strikes, solve_impulses
 from diffrigid.contact.rolling import rolling_stops, with_rows
 from diffrigid.contact.sides import at_colliders, side_sum
-from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
+from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early, turning_back
 from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, is_rolling, may_meet, waits
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.linkage import Linkage, islands, linkage, spread
@@ -217,8 +217,12 @@ def _apply(
         crowd = side_sum(acting, acting, strikes.a, strikes.b, moving)
         stopped = rolling_stops
     P = solve_impulses(strikes, *law, mobility, crowd, world.contact.rest_speed)
-    dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     early_P = stopped(mobility, strikes, P, law, held_for)
+    target, _, most = law
+    if most is not None:
+        back, early_back = turning_back(mobility, strikes, P, target, most, held_for)
+        P, early_P = P + back, early_P + early_back
+    dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
     kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)

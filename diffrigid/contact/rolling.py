@@ -18,14 +18,12 @@ from diffrigid.contact.impulse import sticking_impulse
 from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import at_colliders
-from diffrigid.contact.slipping import lost_to_stops, stopping_early
+from diffrigid.contact.slipping import STICKS, lost_to_stops, stopping_early
 from diffrigid.contact.strikes import coefficients, contact_count
 from diffrigid.flight import Flight, angular_momentum
 from diffrigid.numerics import dot, norm, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
-
-STICKS = 1.0 - 1e-6  # of the bound of friction
 
 
 def with_rows(
@@ -105,7 +103,7 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: tuple, T:
     parts = [(_about, spin * load), (_across, turning(spin, mu) * load)]
     for part, bound in parts[: P.shape[1] - 1]:  # in the plane nothing is across
         slip, end, acting = (part(pair.normal, r) for r in (start, at_end, torque))
-        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound, None)
+        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound, bound)
     return _with_reaction(mobility, strikes, sticks, lost) + _of_slips(mobility, strikes, P, law, T)
 
 

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.contact.cone import put, turning
-from diffrigid.contact.mobility import Mobility, momentum_changes
+from diffrigid.contact.mobility import Mobility, momentum_changes, moved
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import at_colliders, same_bodies
 from diffrigid.numerics import constant, dot, norm, safe_divide, sum_rows
 from diffrigid.pytree import replace
 
+STICKS = 1.0 - 1e-6  # of the bound of friction
 CREEP = 1e-6  # [m/s] of a slip that is none; in single precision the root of rounding is more
 
 
@@ -54,7 +55,10 @@ def stopping_early(
     slip = at_end - T[:, None] * rubbing(strikes.pull)
     bounds = mu * jax.vmap(dot)(n, P)
     bounds = bounds if most is None else jnp.where(jnp.isfinite(most), most, bounds)
-    return lost_to_stops(strikes, T, slip, at_end, friction, bounds, _heaviest(mobility, strikes))
+    most_to_stop = _heaviest(mobility, strikes) * jax.vmap(norm)(at_end)
+    if of_joint is not None:
+        most_to_stop = jnp.where(of_joint, bounds, most_to_stop)
+    return lost_to_stops(strikes, T, slip, at_end, friction, bounds, most_to_stop)
 
 
 def _heaviest(mobility: Mobility, strikes: Strikes) -> Array:
@@ -66,14 +70,14 @@ def _heaviest(mobility: Mobility, strikes: Strikes) -> Array:
 
 
 def lost_to_stops(
-    strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array, heaviest: Array | None
+    strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array, most_to_stop: Array
 ) -> Array:
     """What impulses `friction` (C, D, *batch) within `bounds` (C, *batch) move too little; see `stopping_early`.
 
     Args:
         slip, at_end: (C, D, *batch) [m/s] at the beginning, and at the end without friction.
-        heaviest: (C, *batch) [kg] what can resist the slip at most. All other friction holds against what does not
-            slip, as that at a corner about which a body turns.
+        most_to_stop: (C, *batch) [N s] the friction that can have stopped the slip. All other holds against what does
+            not slip, as that at a corner about which a body turns.
     """
     together = same_bodies(strikes.a, strikes.b)
 
@@ -85,15 +89,45 @@ def lost_to_stops(
     own = -jax.vmap(dot)(friction, at_end / jnp.where(at_end_speed > 0, at_end_speed, 1.0)[:, None])
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
-    if heaviest is not None:
-        most = jnp.minimum(size, heaviest * at_end_speed)
-        own, size = own * safe_divide(most, size), most
+    most = jnp.minimum(size, most_to_stop)
+    own, size = own * safe_divide(most, size), most
     creep = max(CREEP, float(jnp.finfo(T.dtype).eps) ** 0.5)
     whole = at_end_speed * bound + size * (speed - along)
-    stops = strikes.active & (size < (1.0 - 1e-6) * bound) & (T > 0) & (speed > creep)
+    stops = strikes.active & (size < STICKS * bound) & (T > 0) & (speed > creep)
     least = float(jnp.finfo(T.dtype).tiny) ** 0.5  # the derivative of a quotient divides by the square of this
     stops = stops & (at_end_speed > least) & (whole > least)
     share = safe_divide(speed * size, jnp.where(stops, whole, 0.0))  # tau / T
     per_speed = safe_divide(own, jnp.where(stops, at_end_speed, 0.0))
     lost = 0.5 * T * (1.0 - jnp.clip(share, 0.0, 1.0)) * per_speed
     return jnp.where(stops[:, None], -lost[:, None] * slip, 0.0)
+
+
+def turning_back(
+    mobility: Mobility, strikes: Strikes, P: Array, target: Array, most: Array, T: Array
+) -> tuple[Array, Array]:
+    """What friction of joints does otherwise where a motion stops and goes back within T, while it slides all the time.
+
+    Until the stop, at a share of T, it acts the other way than P, which is that of the motion at the end: its impulse
+    is (1 - 2 share) P, and it moves the joint by share (1 - share) T P less. Exact under a constant pull.
+
+    Returns:
+        (C, D, *batch): impulses to add [N s], and what moves bodies beside those [N s^2].
+    """
+    start = len(P) - len(strikes.jac)
+    own, bound, time, pull = P[start:, 0], most[start:], T[start:], strikes.pull[start:, 0]
+    end = strikes.v_rel[start:, 0] - target[start:]
+
+    def on_rows(values: Array) -> Array:  # (R, *batch) as impulses of all, (C, D, *batch)
+        return jnp.pad(values[:, None], [(start, 0), (0, P.shape[1] - 1), *[(0, 0)] * (values.ndim - 1)])
+
+    def rates(impulses: Array) -> Array:
+        return moved(impulses, strikes, mobility)[start:, 0]
+
+    one_each = jnp.eye(len(own), dtype=P.dtype).reshape(len(own), len(own), *[1] * (own.ndim - 1))
+    by_own = (one_each * jax.vmap(lambda values: rates(on_rows(values)))(one_each * own[None])).sum(1)
+    by_all, slip = rates(P), end - time * pull
+    share = safe_divide(slip, 2.0 * by_own - by_all - (end - slip))
+    slides = jnp.isfinite(bound) & (jnp.abs(own) >= STICKS * bound) & (bound > 0) & (time > 0)
+    turns = slides & (slip * (end + by_all) < 0) & (share > 0) & (share < 1)
+    share = jnp.where(turns, share, 0.0)
+    return on_rows(-2.0 * share * own), on_rows(-share * (1.0 - share) * time * own)

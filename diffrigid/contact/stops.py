@@ -19,7 +19,7 @@ from diffrigid.contact.order import Meeting
 from diffrigid.contact.resting import Strikes
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.joints import Pose
-from diffrigid.numerics import FOUND, implicit_root, rows, unit_vector
+from diffrigid.numerics import FOUND, implicit_root, rows, safe_divide, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 
@@ -158,11 +158,16 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
     first = unit_vector(jnp.zeros((so.D, *s.shape), s.dtype), 0)
     none, gap = jnp.zeros_like(first), _gap(kind, joint, a, b)
     open_by = jnp.zeros_like(s) if kind == "friction" else gap(s)
+    if kind == "friction":  # in the mean since the paths begin
+        start = jnp.maximum(a.t0, b.t0)
+        pull = safe_divide(rate - _rate(gap, start)[1], s - start)
+    else:
+        pull = lax.stop_gradient(_second(gap, s))
     touches = ~meeting.held | meeting.rests[0] | (open_by <= jnp.sqrt(jnp.finfo(s.dtype).eps))
     return Strikes(
         active=meeting.hit & touches, s=s, gap=open_by, normal=first, arm_a=none, arm_b=none,
         K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,
-        pull=lax.stop_gradient(_second(gap, s))[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now,
+        pull=pull[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now,
         held=meeting.held, jac=jac,
     )  # fmt: skip
 
