@@ -84,7 +84,7 @@ def crowds(dim):
     return jax.jit(lambda p: jax.lax.map(one, p))(starts(dim))
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_crowds_meet(dim):
     """The tests below say something: in nearly every world bodies collide, and lose energy where they may."""
     states, _, _, energy = crowds(dim)
