@@ -3,7 +3,8 @@
     IMPACT, as often as `sweeps`   the next impact of every body, at its true time, with restitution; before it what
                                    rests is held until then (`order.py`)
     HOLD                           what rests, at the end of the step: the velocities must not close
-    PUSH                           what rests: gaps that rounding or rolling left are closed; momenta are kept,
+    TURN                           instead of HOLD where a slip turns back within the step (`known.py`)
+    PUSH                           what rests: gaps that rounding or turning left are closed; momenta are kept,
                                    energy to the order of the gap
 
 Every pass finds contacts at a time, solves for impulses, and anchors the struck bodies anew; the passes differ
@@ -28,20 +29,32 @@ from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
+from diffrigid.contact.known import Known, beside, loads, turning_back
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
 from diffrigid.contact.order import over_islands
 from diffrigid.contact.resting import Strikes, solve_impulses
 from diffrigid.contact.rolling import rolling_stops, with_rows
 from diffrigid.contact.sides import at_colliders, side_sum
-from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early, turning_back
-from diffrigid.contact.strikes import coefficients, driven, driving, ends, find_strikes, is_rolling, may_meet, waits
+from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
+from diffrigid.contact.strikes import (
+    coefficients,
+    contact_count,
+    driven,
+    driving,
+    ends,
+    find_strikes,
+    is_loaded,
+    is_rolling,
+    may_meet,
+    waits,
+)
 from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
 from diffrigid.linkage import Linkage, islands, linkage, spread
 from diffrigid.numerics import FOUND, constant, dot, safe_divide, some, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State, rotations
 
-IMPACT, HOLD, PUSH = 0, 1, 2
+IMPACT, HOLD, TURN, PUSH = 0, 1, 2, 3
 HOLDS = 2  # passes until the first impact of what rests: one to where it would be in free fall, one from there
 
 
@@ -98,13 +111,13 @@ class Contact:
 
         # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches.
         @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
-        def one_pass(anchors, resting, found, rests, phase):
+        def one_pass(anchors, resting, known, found, rests, phase):
             del found, rests
-            return _pass(world, anchors, launch, resting, dt, phase)
+            return _pass(world, anchors, launch, resting, known, dt, phase)
 
         tables = tables_of(world) if is_crowded(world) else ()
 
-        def isolated_or_any(anchors, resting, found, rests, phase):
+        def isolated_or_any(anchors, resting, known, found, rests, phase):
             flight = lax.stop_gradient(launch(anchors.state, anchors.t0))
             following, isolated, needed = next_impacts(world, tables, flight, anchors.since, dt)
 
@@ -112,30 +125,36 @@ class Contact:
                 return (
                     meet_in_rounds(world, tables, following, needed, anchors, launch, dt),
                     resting,
+                    known,
                     some(needed > 0),
                     rests,
                 )
 
             def any_pass():
-                return one_pass(anchors, resting, found, rests, phase)
+                return one_pass(anchors, resting, known, found, rests, phase)
 
             return lax.cond(isolated & (phase == IMPACT), isolated_pass, any_pass)
 
         def maybe(carry, phase):
-            *_, found, rests = carry
+            *_, known, found, rests = carry
             needed = jnp.where(phase == IMPACT, found, rests)
+            if known is not None:
+                needed = jnp.where(phase == TURN, some(known.turns()), needed)
             some_pass = isolated_or_any if tables else one_pass
             return lax.cond(needed, lambda c: some_pass(*c, phase), lambda c: c, carry), None
 
         impacts = self.sweeps + HOLDS * waits(world)
-        phases = jnp.array([IMPACT] * impacts + [HOLD, PUSH])
-        (end, *_), _ = lax.scan(maybe, (start, resting, near, jnp.asarray(any(always))), phases)
+        loaded, rows = is_loaded(world), len(always) + is_rolling(world) * contact_count(world)
+        phases = jnp.array([IMPACT] * impacts + [HOLD] + [TURN] * loaded + [PUSH])
+        nothing = jnp.zeros((rows, *start.state.x.shape[1:]), start.t0.dtype)
+        known = with_tangents(Known(P=nothing, early=nothing), (world, dt)) if loaded else None
+        (end, *_), _ = lax.scan(maybe, (start, resting, known, near, jnp.asarray(any(always))), phases)
         return end
 
 
-def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Array, phase: Array):
-    """One pass: the anchors after it, the contacts that rest, whether any acted, whether any rests."""
-    impact, push = phase == IMPACT, phase == PUSH
+def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, known: Known | None, dt: Array, phase: Array):
+    """One pass: anchors after it, contacts that rest, impulses that are known, whether any acted, whether any rests."""
+    impact, turn, push = (phase == kind for kind in (IMPACT, TURN, PUSH))
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
     restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
@@ -150,7 +169,10 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | falls)
     found = resting | held | (strikes.active & ~strikes.held & (slow | (strikes.now & rests)))
     held = jnp.where(push, resting & ~drives, held)
-    now, resting = held | (strikes.active & strikes.now), jnp.where(impact, found, held)
+    now, resting = held | (strikes.active & strikes.now), jnp.where(impact, found, jnp.where(turn, resting, held))
+    if known is not None:
+        skips = turn & ~known.turns()
+        now, unused = now & ~skips[None], skips | (push & ~known.opened(strikes.gap))
     began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
     held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
     # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
@@ -161,14 +183,28 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, dt: Ar
     v_rel = jnp.where(push, strikes.gap[:, None] * strikes.normal, strikes.v_rel)
     strikes = replace(strikes, active=now, held=held, v_rel=v_rel)
 
-    def strike(anchors):
+    def strike(anchors, known):
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
         mu = jnp.where(push, 0.0, friction)
-        return _apply(world, anchors, flight, strikes, (target, mu, most), kick, held_for)
+        apply = functools.partial(_apply, world, anchors, flight, strikes, (target, mu, most), kick, held_for)
+        if known is None:
+            return apply(None)[0], None
+        nothing = jax.tree.map(jnp.zeros_like, known)
+        after, turns, load = apply(_choice(unused, nothing, known))
+        turns = _choice(phase == HOLD, turns, nothing)
+        waits, load = turns.turns(), jnp.where(impact | push, 0.0, load)
+        following = replace(turns, P=jnp.where(waits, turns.P, load))
+        return _choice(waits, anchors, after), _choice(skips, known, following)
 
     any_now = some(now)
-    return lax.cond(any_now, strike, lambda anchors: anchors, anchors), resting, any_now, some(resting | strikes.rests)
+    anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
+    return anchors, resting, known, any_now, some(resting | strikes.rests)
+
+
+def _choice(chosen: Array, new: Any, old: Any) -> Any:
+    """By world, or for all of them: (*batch) or (), and two trees."""
+    return jax.tree.map(lambda a, b: jnp.where(jnp.broadcast_to(chosen, a.shape), a, b), new, old)
 
 
 def _flags(flags: tuple[bool, ...], like: Array) -> Array:
@@ -189,7 +225,8 @@ def _apply(
     law: tuple[Array, Array, Array | None],
     kick: Array,
     held_for: Array,
-) -> Anchors:
+    known: Known | None,
+) -> tuple[Anchors, Known | None, Array | None]:
     """Solve for the impulses and anchor every struck body anew at the time of its impact.
 
     Anchoring is the lever x += (h - s) P / m and, for turns, the composition of those before and after s.
@@ -198,6 +235,9 @@ def _apply(
         law: target, mu and most of `solve_impulses`.
         kick: 1, or 0 for a displacement that leaves velocities as they are.
         held_for: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
+
+    Returns:
+        the anchors; where impulses are `known`, those of friction that turns, and what undoes the loads.
     """
     moving, active, held = flight.t0.shape[0], strikes.active.astype(kick.dtype), strikes.held.astype(kick.dtype)
     each = jnp.stack([active, active * strikes.s, held], axis=1)
@@ -216,13 +256,16 @@ def _apply(
         acting = strikes.active.astype(kick.dtype)
         crowd = side_sum(acting, acting, strikes.a, strikes.b, moving)
         stopped = rolling_stops
+    if known is not None:
+        strikes, law = beside(mobility, strikes, law, known)
     P = solve_impulses(strikes, *law, mobility, crowd, world.contact.rest_speed)
-    early_P = stopped(mobility, strikes, P, law, held_for)
-    target, _, most = law
-    if most is not None:
-        back, early_back = turning_back(mobility, strikes, P, target, most, held_for)
-        P, early_P = P + back, early_P + early_back
+    early_P, turns, load = stopped(mobility, strikes, P, law, held_for), None, None
+    if known is not None:
+        load = loads(strikes, P, law[2], held_for)
+        P, early_P = P + known.P, early_P + known.early
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
+    if known is not None:
+        turns = turning_back(strikes, P, (dv, dw), law, held_for)
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
     kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
@@ -232,7 +275,7 @@ def _apply(
         kicked = kicked[0] + onto[0], kicked[1] + onto[2]
     # The path from where a body was held until, followed backwards, is its own but to second order.
     since = jnp.where(count > 0, jnp.where((kick > 0) & (evenly > 0), flight.t0, t), anchors.since)
-    return _anchored(flight, t, q, since, kicked, moved)
+    return _anchored(flight, t, q, since, kicked, moved), turns, load
 
 
 def _onto_joints(flight: Flight, t: Array, link: Linkage, hit: Array) -> tuple[Array, Array, Array]:

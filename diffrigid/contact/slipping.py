@@ -1,13 +1,14 @@
 """Where resting contacts and friction displace bodies within a step, apart from what their even force does."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.contact.cone import put, turning
-from diffrigid.contact.mobility import Mobility, momentum_changes, moved
+from diffrigid.contact.cone import put, split, turning
+from diffrigid.contact.mobility import Mobility, momentum_changes
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import at_colliders, same_bodies
 from diffrigid.numerics import constant, dot, norm, safe_divide, sum_rows
@@ -44,21 +45,34 @@ def stopping_early(
     part of P that goes with the slip at the beginning, with its centroid at half the time tau until the stop instead
     of T / 2: so it moves the contact by a further (T - tau) / 2. Exact for one direction of slip under a constant pull.
     """
-    n, (target, mu, most) = strikes.normal, law
-    of_joint = None if most is None else jnp.isfinite(most)  # it rubs along its coordinate
-
-    def rubbing(r: Array) -> Array:
-        r_t = r - jax.vmap(dot)(n, r)[:, None] * n
-        return r_t if of_joint is None else jnp.where(of_joint[:, None], r, r_t)
-
-    at_end, friction = rubbing(strikes.v_rel - target[:, None] * n), rubbing(P)
-    slip = at_end - T[:, None] * rubbing(strikes.pull)
-    bounds = mu * jax.vmap(dot)(n, P)
-    bounds = bounds if most is None else jnp.where(jnp.isfinite(most), most, bounds)
+    (part, bounds), most = rubbing(strikes, P, law), law[2]
+    at_end, slip = slips(part, strikes, law[0], T)
     most_to_stop = _heaviest(mobility, strikes) * jax.vmap(norm)(at_end)
-    if of_joint is not None:
-        most_to_stop = jnp.where(of_joint, bounds, most_to_stop)
-    return lost_to_stops(strikes, T, slip, at_end, friction, bounds, most_to_stop)
+    if most is not None:
+        most_to_stop = jnp.where(jnp.isfinite(most), bounds, most_to_stop)
+    return lost_to_stops(strikes, T, slip, at_end, part(P), bounds, most_to_stop)
+
+
+def rubbing(strikes: Strikes, P: Array, law: tuple) -> tuple[Callable, Array]:
+    """The part of a vector at every contact (C, D, *batch) that friction acts along, and its bounds (C, *batch) [N s].
+
+    That of a joint rubs along its coordinate.
+    """
+    n, (_, mu, most) = strikes.normal, law
+    of_joint = None if most is None else jnp.isfinite(most)
+
+    def part(r: Array) -> Array:
+        across = split(n, r)[1]
+        return across if of_joint is None else jnp.where(of_joint[:, None], r, across)
+
+    bounds = mu * jax.vmap(dot)(n, P)
+    return part, bounds if of_joint is None else jnp.where(of_joint, most, bounds)
+
+
+def slips(part: Callable, strikes: Strikes, target: Array, T: Array) -> tuple[Array, Array]:
+    """Slip after T without impulses, and at the beginning, (C, D, *batch) [m/s]."""
+    at_end = part(strikes.v_rel - target[:, None] * strikes.normal)
+    return at_end, at_end - T[:, None] * part(strikes.pull)
 
 
 def _heaviest(mobility: Mobility, strikes: Strikes) -> Array:
@@ -67,6 +81,11 @@ def _heaviest(mobility: Mobility, strikes: Strikes) -> Array:
         return jnp.broadcast_to((1.0 / mobility.inverse_mass).sum(0)[None], strikes.s.shape)
     a, b = (at_colliders(mobility.inverse_mass, side, 0.0) for side in (strikes.a, strikes.b))
     return 1.0 / (a + b)
+
+
+def least_slip(dtype: Any) -> float:
+    """What is slower does not slip [m/s]."""
+    return max(CREEP, float(jnp.finfo(dtype).eps) ** 0.5)
 
 
 def lost_to_stops(
@@ -91,43 +110,11 @@ def lost_to_stops(
     size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
     most = jnp.minimum(size, most_to_stop)
     own, size = own * safe_divide(most, size), most
-    creep = max(CREEP, float(jnp.finfo(T.dtype).eps) ** 0.5)
     whole = at_end_speed * bound + size * (speed - along)
-    stops = strikes.active & (size < STICKS * bound) & (T > 0) & (speed > creep)
+    stops = strikes.active & (size < STICKS * bound) & (T > 0) & (speed > least_slip(T.dtype))
     least = float(jnp.finfo(T.dtype).tiny) ** 0.5  # the derivative of a quotient divides by the square of this
     stops = stops & (at_end_speed > least) & (whole > least)
     share = safe_divide(speed * size, jnp.where(stops, whole, 0.0))  # tau / T
     per_speed = safe_divide(own, jnp.where(stops, at_end_speed, 0.0))
     lost = 0.5 * T * (1.0 - jnp.clip(share, 0.0, 1.0)) * per_speed
     return jnp.where(stops[:, None], -lost[:, None] * slip, 0.0)
-
-
-def turning_back(
-    mobility: Mobility, strikes: Strikes, P: Array, target: Array, most: Array, T: Array
-) -> tuple[Array, Array]:
-    """What friction of joints does otherwise where a motion stops and goes back within T, while it slides all the time.
-
-    Until the stop, at a share of T, it acts the other way than P, which is that of the motion at the end: its impulse
-    is (1 - 2 share) P, and it moves the joint by share (1 - share) T P less. Exact under a constant pull.
-
-    Returns:
-        (C, D, *batch): impulses to add [N s], and what moves bodies beside those [N s^2].
-    """
-    start = len(P) - len(strikes.jac)
-    own, bound, time, pull = P[start:, 0], most[start:], T[start:], strikes.pull[start:, 0]
-    end = strikes.v_rel[start:, 0] - target[start:]
-
-    def on_rows(values: Array) -> Array:  # (R, *batch) as impulses of all, (C, D, *batch)
-        return jnp.pad(values[:, None], [(start, 0), (0, P.shape[1] - 1), *[(0, 0)] * (values.ndim - 1)])
-
-    def rates(impulses: Array) -> Array:
-        return moved(impulses, strikes, mobility)[start:, 0]
-
-    one_each = jnp.eye(len(own), dtype=P.dtype).reshape(len(own), len(own), *[1] * (own.ndim - 1))
-    by_own = (one_each * jax.vmap(lambda values: rates(on_rows(values)))(one_each * own[None])).sum(1)
-    by_all, slip = rates(P), end - time * pull
-    share = safe_divide(slip, 2.0 * by_own - by_all - (end - slip))
-    slides = jnp.isfinite(bound) & (jnp.abs(own) >= STICKS * bound) & (bound > 0) & (time > 0)
-    turns = slides & (slip * (end + by_all) < 0) & (share > 0) & (share < 1)
-    share = jnp.where(turns, share, 0.0)
-    return on_rows(-2.0 * share * own), on_rows(-share * (1.0 - share) * time * own)

@@ -1,0 +1,92 @@
+"""Impulses that a pass knows from the one before it, and that the others are solved beside.
+
+Friction that turns back   Where a slip stops within the time that a contact is held for and goes back, friction acts
+                           one way first and then the other. Its sum follows from the impulses of a pass in which it
+                           acts one way: that pass is not applied, and the next one knows it.
+Loads                      What carries a load stays where it is, in both directions: what the load has moved by is
+                           taken back, and found anew with the gaps closed. So a gap closes that has opened beside
+                           another one, where what rests was turned within the step.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.contact.cone import put, split, turning
+from diffrigid.contact.mobility import Mobility, moved, relative_changes
+from diffrigid.contact.resting import Strikes
+from diffrigid.contact.sides import same_bodies
+from diffrigid.contact.slipping import least_slip, rubbing, slips
+from diffrigid.numerics import dot, norm, normalise, safe_divide, some, sum_rows
+from diffrigid.pytree import array, pytree, replace
+
+
+@pytree
+class Known:
+    """Impulses that are known, on body a of each contact and row; else 0."""
+
+    P: Array = array("C", "D")  # [N s]; where gaps are closed [kg m]
+    early: Array = array("C", "D")  # [N s^2] what they move bodies by beside an even force: not 0 where friction turns
+
+    def turns(self) -> Array:
+        """Whether some friction turns in a world, (*batch) bool."""
+        return (self.early != 0).any((0, 1))
+
+    def opened(self, gap: Array) -> Array:
+        """Whether a gap (C, *batch) of a world is open where a contact carries a load, (*batch) bool."""
+        turning_rows = len(self.P) - len(gap)
+        P = jnp.concatenate([self.P[:turning_rows], self.P[2 * turning_rows :]]) if turning_rows else self.P
+        return ((gap > 0) & (P != 0).any(1)).any(0)
+
+
+def beside(mobility: Mobility, strikes: Strikes, law: tuple, known: Known) -> tuple[Strikes, tuple]:
+    """Strikes and law (target, mu, most) of the impulses that are not known. Friction that is known acts no more."""
+    (target, mu, most), rubs = law, (known.early != 0).any(1)
+    most = None if most is None else jnp.where(rubs & jnp.isfinite(most), 0.0, most)
+    strikes = replace(strikes, v_rel=strikes.v_rel + moved(known.P, strikes, mobility))
+    return strikes, (target, jnp.where(rubs, 0.0, mu), most)
+
+
+def turning_back(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: tuple, T: Array) -> Known:
+    """Friction where a slip stops and goes back within T, from impulses P that take it to act one way.
+
+    Until the stop, at a share of T, it acts one way with all of its bound, from then on the other, evenly: the sum is
+    (1 - 2 share) of the second, and moves the contact by share (1 - share) T of it less. Exact for one direction of
+    slip under a constant pull.
+
+    Args:
+        changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P.
+        law: target, mu and most of `solve_impulses`.
+    """
+    held = strikes.active & strikes.held & (T > 0)
+
+    def found(P: Array, changes: tuple[Array, Array], law: tuple) -> Known:
+        (friction, bounds), together = rubbing(strikes, P, law), same_bodies(strikes.a, strikes.b)
+        at_end, slip = slips(friction, strikes, law[0], T)
+        pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
+        along = slip, friction(relative_changes(strikes, *changes)), sum_rows(friction(P), together)
+        against, braked, rubs = (-jax.vmap(dot)(r, back) for r in along)
+        stops = held & (against > least_slip(T.dtype))
+        # How all of the bound brakes the slip, by what those impulses do.
+        drag = safe_divide(sum_rows(bounds, together) * braked, jnp.where(stops, rubs, 0.0))
+        turns = stops & (drag > 0) & (pull > drag) & (against < pull + drag)
+        share = safe_divide(against, jnp.where(turns, pull + drag, 0.0))[:, None]
+        after = jnp.where(turns[:, None], -bounds[:, None] * back, 0.0)
+        return Known(P=(1.0 - 2.0 * share) * after, early=-share * (1.0 - share) * T[:, None] * after)
+
+    def nothing(P: Array, changes: tuple[Array, Array], law: tuple) -> Known:
+        del changes, law
+        return Known(P=jnp.zeros_like(P), early=jnp.zeros_like(P))
+
+    return lax.cond(some(held), found, nothing, P, changes, law)
+
+
+def loads(strikes: Strikes, P: Array, most: Array | None, T: Array) -> Array:
+    """What undoes the displacement by the loads of contacts that are held for T, (C, D, *batch) [kg m]."""
+    carries: Any = strikes.held if most is None else strikes.held & jnp.isinf(most)
+    pushed = jnp.where(carries, 0.5 * T * jnp.maximum(split(strikes.normal, P)[0], 0.0), 0.0)
+    if strikes.spin is not None:
+        pushed = put(strikes.spin, pushed, jnp.zeros_like(turning(strikes.spin, pushed)))
+    return -pushed[:, None] * strikes.normal
