@@ -141,6 +141,7 @@ def _along(f: Flight, first: Motion, mean: Motion, early: Array, last: Array, T:
     return replace(f, tau=first.L, twist=safe_divide(2.0 * (mean.L - first.L), T), turn=turn)
 
 
+@jax.jit
 def position(f: Flight, s: Array) -> Array:
     """Centre of mass of one body at time s, (D, *batch) [m]."""
     t = (s - f.t0)[None]
@@ -148,6 +149,7 @@ def position(f: Flight, s: Array) -> Array:
     return f.x + t * (f.v + 0.5 * t * rate)
 
 
+@jax.jit
 def orientation(f: Flight, s: Array) -> Array:
     """Orientation of one body at time s, (Q, *batch)."""
     so, t = rotations(f.dim), (s - f.t0)[None]
@@ -157,6 +159,7 @@ def orientation(f: Flight, s: Array) -> Array:
     return so.turn_in_body(f.q, t * phi)
 
 
+@jax.jit
 def velocity(f: Flight, s: Array) -> Array:
     """Velocity of the centre of mass of one body at time s, (D, *batch) [m/s]."""
     t = (s - f.t0)[None]
@@ -164,6 +167,7 @@ def velocity(f: Flight, s: Array) -> Array:
     return f.v + t * rate
 
 
+@jax.jit
 def angular_momentum(f: Flight, s: Array) -> Array:
     """Angular momentum of one body about its centre of mass at time s, (A, *batch) [kg m^2/s]."""
     if f.tau is None:

@@ -6,6 +6,7 @@ inertia is a number, (*batch). Vectors (2, *batch). World and body rotation rate
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -20,11 +21,13 @@ def perp(r: Array) -> Array:
     return sign * r[::-1]
 
 
+@jax.jit
 def rotate(q: Array, r: Array) -> Array:
     """Body axes to world axes."""
     return q[:1] * r + q[1:] * perp(r)
 
 
+@jax.jit
 def unrotate(q: Array, r: Array) -> Array:
     """World axes to body axes."""
     return q[:1] * r - q[1:] * perp(r)
@@ -64,6 +67,7 @@ def log(q: Array) -> Array:
     return jnp.arctan2(q[1:], q[:1])
 
 
+@jax.jit
 def cross(w: Array, r: Array) -> Array:
     """w x r: velocity of a point at r on a body that spins with w."""
     return w * perp(r)

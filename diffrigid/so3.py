@@ -16,6 +16,7 @@ D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orien
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
 
 
+@jax.jit
 def cross(w: Array, r: Array) -> Array:
     """w x r: velocity of a point at r on a body that spins with w."""
     (a, b, c), (x, y, z) = w, r
@@ -25,6 +26,7 @@ def cross(w: Array, r: Array) -> Array:
 moment = cross  # r x F: torque of a force F at r
 
 
+@jax.jit
 def rotate(q: Array, r: Array) -> Array:
     """Body axes to world axes: r + 2 s (u x r) + 2 u x (u x r)."""
     s, x, y, z = q
@@ -38,6 +40,7 @@ def _rotated(s: Array, x: Array, y: Array, z: Array, r: Any) -> list[Array]:
     return [a + s * p + y * r - z * q, b + s * q + z * p - x * r, c + s * r + x * q - y * p]
 
 
+@jax.jit
 def unrotate(q: Array, r: Array) -> Array:
     """World axes to body axes."""
     s, x, y, z = q
@@ -105,6 +108,7 @@ def log(q: Array) -> Array:
     return scale[None] * u
 
 
+@jax.jit
 def matrix_product(m: Array, r: Array) -> Array:
     """(3, 3, *batch) times (3, *batch)."""
     return components(*_product_of_rows(_entries(m), r))
@@ -147,6 +151,7 @@ def unspin(inverse: Array, q: Array, L: Array) -> Array:
     return spin(inverse, q, L)
 
 
+@jax.jit
 def world_inverse(inverse: Array, q: Array) -> Array:
     """Inverse inertia in world axes, R I^-1 R^T, (3, 3, *batch); `apply` multiplies by it."""
     R = _matrix(q)

@@ -81,7 +81,7 @@ def test_two_blocks_slide_as_one():
         return jnp.stack([end.x[-1, :, 0] - end.x[0, :, 0], end.v[-1, :, 0]])
 
     p = {name: jnp.asarray(value) for name, value in {"m": 1.3, "v": 3.0, "mu": 0.4}.items()}
-    slopes, got = jax.jacfwd(lambda p: (end := at_end(p), end), has_aux=True)(p)
+    slopes, got = jax.jit(jax.jacfwd(lambda p: (end := at_end(p), end), has_aux=True))(p)
     expected = [p["v"] * time - 0.5 * p["mu"] * G * time**2], [p["v"] - p["mu"] * G * time]
     np.testing.assert_allclose(got, np.broadcast_to(expected, (2, 2)), rtol=1e-12)
     right = {"m": [[0.0], [0.0]], "v": [[time], [1.0]], "mu": [[-0.5 * G * time**2], [-G * time]]}

@@ -53,12 +53,14 @@ def loaded(cone: Cone, normal: Array, z_n: Array, bound: Array) -> tuple[Array, 
     return put(cone.spin, normal, along), put(cone.spin, bound, turning(cone.spin, cone.mu) * load)
 
 
+@jax.jit
 def split(normal: Array, z: Array) -> tuple[Array, Array]:
     """Normal component and tangential part."""
     z_n = jax.vmap(dot)(normal, z)
     return z_n, z - z_n[:, None] * normal
 
 
+@jax.jit
 def allowed(cone: Cone, z: Array) -> Array:
     """The impulse that pushes as z does, and rubs as z does, but with no more than mu times that; (C, D, *batch)."""
     z_n, z_t = split(cone.normal, jnp.where(cone.on[:, None] > 0, z, 0.0))

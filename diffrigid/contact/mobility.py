@@ -96,6 +96,7 @@ def jointed(link: Linkage, inertia: Array) -> Mobility:
     return replace(free, inertia=inertia, matrix=jax.vmap(twist, out_axes=1)(units))
 
 
+@jax.jit
 def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, Array]:
     """Changes of v [m/s], w [rad/s] and L by impulses dp and dL on the bodies, and by what the joints make of them."""
     apply = rotations(dp.shape[1]).apply
@@ -106,6 +107,7 @@ def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, 
     return dv, dw, jax.vmap(apply)(mobility.inertia, dw)
 
 
+@jax.jit
 def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
     """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
     if min(arms.b) >= len(dv):  # with statics only
@@ -148,11 +150,13 @@ def _first(values: Array, D: int) -> Array:
     return values[:, None] * unit_vector(jnp.zeros((D, *values.shape[1:]), values.dtype), 0)[None]
 
 
+@jax.jit
 def moved(P: Array, arms: Any, mobility: Mobility) -> Array:
     """J G J^T P: changes of the relative velocities by impulses, (C, D, *batch) [m/s]."""
     return relative_changes(arms, *velocities(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))[:2])
 
 
+@jax.jit
 def twists(P: Array, arms: Any, mobility: Mobility) -> Array:
     """G J^T P: the change of the twists of all bodies by impulses, (R, *batch)."""
     return _twists(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
@@ -163,6 +167,7 @@ def _twists(mobility: Mobility, dp: Array, dL: Array) -> Array:
     return jnp.concatenate(velocities(mobility, dp, dL)[:2], axis=1).reshape(-1, *dp.shape[2:])
 
 
+@jax.jit
 def at_contacts(arms: Any, twist: Array) -> Array:
     """J u: `relative_changes` for the twists of all bodies in one, (R, *batch)."""
     D = arms.arm_a.shape[1]

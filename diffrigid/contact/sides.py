@@ -66,6 +66,7 @@ def side_of(world: Any, flight: Flight, since: Array, kind: int, shape_rows: tup
     return Side(flight=None, shape=shape, offset=offset, x=x, q=q)
 
 
+@jax.jit
 def place(side: Side, s: Array, live: Array) -> Placed:
     """The collider at time s (*batch) [s]; for `live` see `apart`."""
     f = side.flight
@@ -148,6 +149,7 @@ def _difference(of, at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> A
     return -of(at_b, arm_b) if at_a.v is None else of(at_a, arm_a) - of(at_b, arm_b)
 
 
+@jax.jit
 def gap_rates(contacts: Contacts, at_a: Placed, at_b: Placed) -> Array:
     """d(gap)/ds of every contact, (K, *batch) [m/s]: the normal velocity of a against b at the contact point."""
 
