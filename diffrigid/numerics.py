@@ -5,8 +5,8 @@ reverse mode multiplies the derivative of the branch not taken by zero, and 0 * 
 
 Vectors carry their components on the leading axis, `(D, *batch)`.
 
-What is called in many places is jitted, here and elsewhere, so that it is traced, differentiated and transposed once for
-all of them; XLA writes it out. A gradient is traced in three quarters of the time.
+What is called in many places is jitted, here and elsewhere, so that it is traced, differentiated and transposed once
+for all of them; XLA writes it out. A gradient is traced in three quarters of the time.
 """
 
 import functools
