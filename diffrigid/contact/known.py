@@ -16,7 +16,7 @@ from jax import Array, lax
 
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
-from diffrigid.contact.resting import Strikes
+from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import same_bodies
 from diffrigid.contact.slipping import least_slip, rubbing, slips
 from diffrigid.numerics import dot, norm, normalise, safe_divide, some, sum_rows
@@ -41,15 +41,15 @@ class Known:
         return ((gap > 0) & (P != 0).any(1)).any(0)
 
 
-def beside(mobility: Mobility, strikes: Strikes, law: tuple, known: Known) -> tuple[Strikes, tuple]:
-    """Strikes and law (target, mu, most) of the impulses that are not known. Friction that is known acts no more."""
+def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tuple[Strikes, Law]:
+    """Strikes and law of the impulses that are not known. Friction that is known acts no more."""
     (target, mu, most), rubs = law, (known.early != 0).any(1)
     most = None if most is None else jnp.where(rubs & jnp.isfinite(most), 0.0, most)
     strikes = replace(strikes, v_rel=strikes.v_rel + moved(known.P, strikes, mobility))
-    return strikes, (target, jnp.where(rubs, 0.0, mu), most)
+    return strikes, Law(target, jnp.where(rubs, 0.0, mu), most)
 
 
-def turning_back(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: tuple, T: Array) -> Known:
+def turning_back(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array) -> Known:
     """Friction where a slip stops and goes back within T, from impulses P that take it to act one way.
 
     Until the stop, at a share of T, it acts one way with all of its bound, from then on the other, evenly: the sum is
@@ -58,13 +58,12 @@ def turning_back(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: 
 
     Args:
         changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P.
-        law: target, mu and most of `solve_impulses`.
     """
     held = strikes.active & strikes.held & (T > 0)
 
-    def found(P: Array, changes: tuple[Array, Array], law: tuple) -> Known:
+    def found(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
         (friction, bounds), together = rubbing(strikes, P, law), same_bodies(strikes.a, strikes.b)
-        at_end, slip = slips(friction, strikes, law[0], T)
+        at_end, slip = slips(friction, strikes, law.target, T)
         pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
         along = slip, friction(relative_changes(strikes, *changes)), sum_rows(friction(P), together)
         against, braked, rubs = (-jax.vmap(dot)(r, back) for r in along)
@@ -76,7 +75,7 @@ def turning_back(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: 
         after = jnp.where(turns[:, None], -bounds[:, None] * back, 0.0)
         return Known(P=(1.0 - 2.0 * share) * after, early=-share * (1.0 - share) * T[:, None] * after)
 
-    def nothing(P: Array, changes: tuple[Array, Array], law: tuple) -> Known:
+    def nothing(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
         del changes, law
         return Known(P=jnp.zeros_like(P), early=jnp.zeros_like(P))
 

@@ -7,14 +7,10 @@
     PUSH                           what rests: gaps that rounding or turning left are closed; momenta are kept,
                                    energy to the order of the gap
 
-Every pass finds contacts at a time, solves for impulses, and anchors the struck bodies anew; the passes differ
+Every pass finds contacts at a time, solves for impulses, and anchors the struck bodies anew (`apply.py`); they differ
 in the time, the target of the law, and in how long the impulse has acted. A pass that no world of the batch
 needs is skipped. An impact that the sweeps leave over is found late by the next step, with a negative time,
 and repaired.
-
-A resting contact force is taken as constant since the last impact of the body, a time T before: it
-gives P, so v += P / m and x += (T / 2) P / m, its centroid being in the middle, where it has the arms that the contact
-had then. For a block that slides on a floor under Coulomb friction this is exact; for what tips over, second order.
 """
 
 import functools
@@ -25,17 +21,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.contact.anchors import Anchors, struck
+from diffrigid.contact.anchors import Anchors
+from diffrigid.contact.apply import apply_impulses
 from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
-from diffrigid.contact.known import Known, beside, loads, turning_back
-from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
-from diffrigid.contact.order import over_islands
-from diffrigid.contact.resting import Strikes, solve_impulses
-from diffrigid.contact.rolling import rolling_stops, with_rows
-from diffrigid.contact.sides import at_colliders, side_sum
-from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
+from diffrigid.contact.known import Known
+from diffrigid.contact.resting import Law
+from diffrigid.contact.sides import at_colliders
 from diffrigid.contact.strikes import (
     coefficients,
     contact_count,
@@ -48,11 +41,10 @@ from diffrigid.contact.strikes import (
     may_meet,
     waits,
 )
-from diffrigid.flight import Flight, angular_momentum, orientation, position, state_at, velocity
-from diffrigid.linkage import Linkage, islands, linkage, spread
+from diffrigid.flight import Flight, state_at
 from diffrigid.numerics import FOUND, constant, dot, safe_divide, some, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
-from diffrigid.state import State, rotations
+from diffrigid.state import State
 
 IMPACT, HOLD, TURN, PUSH = 0, 1, 2, 3
 HOLDS = 2  # passes until the first impact of what rests: one to where it would be in free fall, one from there
@@ -187,11 +179,13 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, known:
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
         mu = jnp.where(push, 0.0, friction)
-        apply = functools.partial(_apply, world, anchors, flight, strikes, (target, mu, most), kick, held_for)
+        applied = functools.partial(
+            apply_impulses, world, anchors, flight, strikes, Law(target, mu, most), kick, held_for
+        )
         if known is None:
-            return apply(None)[0], None
+            return applied(None)[0], None
         nothing = jax.tree.map(jnp.zeros_like, known)
-        after, turns, load = apply(_choice(unused, nothing, known))
+        after, turns, load = applied(_choice(unused, nothing, known))
         turns = _choice(phase == HOLD, turns, nothing)
         waits, load = turns.turns(), jnp.where(impact | push, 0.0, load)
         following = replace(turns, P=jnp.where(waits, turns.P, load))
@@ -215,104 +209,3 @@ def _flags(flags: tuple[bool, ...], like: Array) -> Array:
 def _fall(flight: Flight, dt: Array) -> Array:
     """Speed of free fall after the step, (*batch) [m/s]: what closes no faster than twice that has rested before it."""
     return dt * jnp.sqrt((flight.a**2).sum(1).max(0))
-
-
-def _apply(
-    world: Any,
-    anchors: Anchors,
-    flight: Flight,
-    strikes: Strikes,
-    law: tuple[Array, Array, Array | None],
-    kick: Array,
-    held_for: Array,
-    known: Known | None,
-) -> tuple[Anchors, Known | None, Array | None]:
-    """Solve for the impulses and anchor every struck body anew at the time of its impact.
-
-    Anchoring is the lever x += (h - s) P / m and, for turns, the composition of those before and after s.
-
-    Args:
-        law: target, mu and most of `solve_impulses`.
-        kick: 1, or 0 for a displacement that leaves velocities as they are.
-        held_for: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
-
-    Returns:
-        the anchors; where impulses are `known`, those of friction that turns, and what undoes the loads.
-    """
-    moving, active, held = flight.t0.shape[0], strikes.active.astype(kick.dtype), strikes.held.astype(kick.dtype)
-    each = jnp.stack([active, active * strikes.s, held], axis=1)
-    own = side_sum(each, each, strikes.a, strikes.b, moving)
-    count, total, evenly = jnp.moveaxis(over_islands(jnp.sum, own, islands(world.joints, moving), 0.0), 1, 0)
-    t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
-    # Displacement per change of velocity [s]: a force that has acted evenly has its centroid in the middle.
-    lever = jnp.where(kick > 0, jnp.where(evenly > 0, 0.5 * (t - flight.t0), 0.0), 1.0)
-    q, mobility, link = _posed(world, flight, t)
-    onto = None if link is None else _onto_joints(flight, t, link, (count > 0) & (kick > 0))
-    if onto is not None:
-        strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
-    crowd, stopped = own[:, 0], stopping_early
-    if is_rolling(world):
-        strikes, law, held_for = with_rows(world, strikes, law, held_for, flight, t, mobility, kick)
-        acting = strikes.active.astype(kick.dtype)
-        crowd = side_sum(acting, acting, strikes.a, strikes.b, moving)
-        stopped = rolling_stops
-    if known is not None:
-        strikes, law = beside(mobility, strikes, law, known)
-    P = solve_impulses(strikes, *law, mobility, crowd, world.contact.rest_speed)
-    early_P, turns, load = stopped(mobility, strikes, P, law, held_for), None, None
-    if known is not None:
-        load = loads(strikes, P, law[2], held_for)
-        P, early_P = P + known.P, early_P + known.early
-    dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    if known is not None:
-        turns = turning_back(strikes, P, (dv, dw), law, held_for)
-    early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
-    moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
-    kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
-    kept = kept + keeping_spin(strikes, drift_after(strikes, dv), early_P, moving)
-    kicked = kick * dv, kick * dL + kept
-    if onto is not None:
-        kicked = kicked[0] + onto[0], kicked[1] + onto[2]
-    # The path from where a body was held until, followed backwards, is its own but to second order.
-    since = jnp.where(count > 0, jnp.where((kick > 0) & (evenly > 0), flight.t0, t), anchors.since)
-    return _anchored(flight, t, q, since, kicked, moved), turns, load
-
-
-def _onto_joints(flight: Flight, t: Array, link: Linkage, hit: Array) -> tuple[Array, Array, Array]:
-    """Changes of v, w and L that bring the velocities of bodies that are `hit` (N, *batch) onto their joints.
-
-    A flight leaves the joints by the error of its integration. Contacts cannot mend that: two that stick on two bodies
-    of one linkage would press without bound.
-    """
-    apply, on = rotations(flight.dim).apply, hit[:, None].astype(t.dtype)
-    v, L = jax.vmap(velocity)(flight, t), jax.vmap(angular_momentum)(flight, t)
-    return spread(link, on * v, on * jax.vmap(apply)(link.inverse_inertia, L))
-
-
-def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility, Linkage | None]:
-    """Orientations of all bodies, each at its own time t (N, *batch), their mobility there, and their joints."""
-    q, so = jax.vmap(orientation)(flight, t), rotations(flight.dim)
-    if world.joints:
-        link = linkage(world.joints, world.statics, world.bodies, jax.vmap(position)(flight, t), q)
-        return q, jointed(link, jax.vmap(so.world_inverse)(world.bodies.inertia, q)), link
-    inverse = jax.vmap(so.world_inverse)(flight.inverse_inertia, q)
-    return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse), None
-
-
-def _anchored(flight: Flight, t: Array, q: Array, since: Array, kicked: tuple, moved: tuple) -> Anchors:
-    """Every body anchored anew at its time t.
-
-    Args:
-        q: orientations at t.
-        since: (N, *batch) [s] from when on its new path holds.
-        kicked: changes of v (N, D, *batch) [m/s] and L (N, A, *batch) [N m s].
-        moved: displacement (N, D, *batch) [m] and turn (N, A, *batch) [rad]; L is kept in the turn.
-    """
-    so = rotations(flight.dim)
-
-    def one(f: Flight, t: Array, q: Array, dv: Array, dL: Array, dx: Array, turn: Array) -> State:
-        after = struck(f, t, so.turn_by(turn, q), dv, dL)
-        return replace(after, x=after.x + dx)
-
-    state = jax.vmap(one)(flight, t, q, *kicked, *moved)
-    return Anchors(state=state, t0=t, since=since)

@@ -1,6 +1,6 @@
 """Many contacts at once: those that share a body at the same time, in an impact or at rest."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -41,22 +41,25 @@ class Strikes:
     spin: Any = array("K", default=None)  # [m] of K rows behind the first K contacts, against turning; see `Cone`
 
 
-def solve_impulses(
-    strikes: Strikes, target: Array, mu: Array, most: Array | None, mobility: Mobility, crowd: Array, rest_speed: Array
-) -> Array:
+class Law(NamedTuple):
+    """What contacts and rows demand, each (C, *batch)."""
+
+    target: Array  # [m/s] normal velocity after the impulse
+    mu: Array  # [-]
+    most: Array | None  # [N s] of the normal impulse, to both sides; infinite: it pushes, without bound. None: all do
+
+
+def solve_impulses(strikes: Strikes, law: Law, mobility: Mobility, crowd: Array, rest_speed: Array) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
     A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `together.py`,
     which is not even compiled for a world where all are always alone, as one disc over a floor.
 
     Args:
-        target: (C, *batch) [m/s] normal velocity after the impulse.
-        mu: (C, *batch) [-].
-        most: (C, *batch) [N s] of the normal impulse, to both sides; where infinite it pushes, without bound. None:
-            so everywhere.
         crowd: (N, *batch) number of active contacts of each body.
         rest_speed: (*batch) [m/s] what is slow in these worlds.
     """
+    target, mu, most = law
     if mobility.matrix is None and are_alone(strikes.a, strikes.b, len(crowd)):
         return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu)
     others = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))

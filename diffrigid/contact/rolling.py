@@ -16,7 +16,7 @@ from jax import Array
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.impulse import sticking_impulse
 from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
-from diffrigid.contact.resting import Strikes
+from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders
 from diffrigid.contact.slipping import STICKS, lost_to_stops, stopping_early
 from diffrigid.contact.strikes import coefficients, contact_count
@@ -27,9 +27,9 @@ from diffrigid.state import rotations
 
 
 def with_rows(
-    world: Any, strikes: Strikes, law: tuple, T: Array, flight: Flight, t: Array, mobility: Mobility, kick: Array
-) -> tuple[Strikes, tuple, Array]:
-    """Strikes, law (target, mu, most) and times T of `solve_impulses` with the rows.
+    world: Any, strikes: Strikes, law: Law, T: Array, flight: Flight, t: Array, mobility: Mobility, kick: Array
+) -> tuple[Strikes, Law, Array]:
+    """Strikes, law and times T of `solve_impulses` with the rows.
 
     Args:
         T: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
@@ -63,7 +63,7 @@ def with_rows(
     target, mu, most = law
     mu = jnp.broadcast_to(mu, target.shape)
     most = None if most is None else _behind(count, most, jnp.full_like(zero, jnp.inf))
-    law = _behind(count, target, zero), _behind(count, mu, roll), most
+    law = Law(_behind(count, target, zero), _behind(count, mu, roll), most)
     return strikes, law, _behind(count, T, T[:count])
 
 
@@ -86,13 +86,13 @@ def _mobility_of_turns(mobility: Mobility, a: tuple[int, ...], b: tuple[int, ...
     return jnp.pad(inverse[:, None, None], [(0, 0), (0, 1), (0, 1), *[(0, 0)] * (inverse.ndim - 1)])
 
 
-def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: tuple, T: Array) -> Array:
+def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
     """`stopping_early`, and the same for rolling and spinning that stop, (C, D, *batch) [N s^2].
 
     Where a contact sticks, the torque of its row brings an impulse with it that keeps the contact from slipping. Both
     have the same centroid in time. Exact for one contact of two bodies.
     """
-    spin, mu, torque = strikes.spin, law[1], turning(strikes.spin, P)
+    spin, mu, torque = strikes.spin, law.mu, turning(strikes.spin, P)
     sticks = _sticks(strikes, P, mu)
     pair = rows_of(strikes)
     start = pair.v_rel - turning(spin, T)[:, None] * pair.pull
@@ -148,7 +148,7 @@ def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: 
     return jnp.concatenate([sticks[:, None] * P, torque, zero])
 
 
-def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: tuple, T: Array) -> Array:
+def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
     """`stopping_early` of contacts and rows of joints; to them the torques are a pull that acts evenly."""
     spin, count = strikes.spin, len(strikes.spin)
     by_torque = _changes(mobility, strikes, put(spin, jnp.zeros_like(P), turning(spin, P)))

@@ -9,7 +9,7 @@ from jax import Array
 
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, momentum_changes
-from diffrigid.contact.resting import Strikes
+from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders, same_bodies
 from diffrigid.numerics import constant, dot, norm, safe_divide, sum_rows
 from diffrigid.pytree import replace
@@ -36,37 +36,36 @@ def drift_after(strikes: Strikes, dv: Array) -> Array:
     return strikes.drift + both.reshape(-1, *[1] * (dv.ndim - 1)) * change
 
 
-def stopping_early(
-    mobility: Mobility, strikes: Strikes, P: Array, law: tuple[Array, Array, Array | None], T: Array
-) -> Array:
+def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
     """What the impulses P, taken as even over T, move too little where the slip stops before: (C, D, *batch) [N s^2].
 
     Friction first stops the slip with all of its bound, then holds against the pull, evenly. Stopping takes the
     part of P that goes with the slip at the beginning, with its centroid at half the time tau until the stop instead
     of T / 2: so it moves the contact by a further (T - tau) / 2. Exact for one direction of slip under a constant pull.
     """
-    (part, bounds), most = rubbing(strikes, P, law), law[2]
-    at_end, slip = slips(part, strikes, law[0], T)
+    (part, bounds), most = rubbing(strikes, P, law), law.most
+    at_end, slip = slips(part, strikes, law.target, T)
     most_to_stop = _heaviest(mobility, strikes) * jax.vmap(norm)(at_end)
     if most is not None:
         most_to_stop = jnp.where(jnp.isfinite(most), bounds, most_to_stop)
     return lost_to_stops(strikes, T, slip, at_end, part(P), bounds, most_to_stop)
 
 
-def rubbing(strikes: Strikes, P: Array, law: tuple) -> tuple[Callable, Array]:
+def rubbing(strikes: Strikes, P: Array, law: Law) -> tuple[Callable, Array]:
     """The part of a vector at every contact (C, D, *batch) that friction acts along, and its bounds (C, *batch) [N s].
 
     That of a joint rubs along its coordinate.
     """
     n, (_, mu, most) = strikes.normal, law
-    of_joint = None if most is None else jnp.isfinite(most)
-
-    def part(r: Array) -> Array:
-        across = split(n, r)[1]
-        return across if of_joint is None else jnp.where(of_joint[:, None], r, across)
-
     bounds = mu * jax.vmap(dot)(n, P)
-    return part, bounds if of_joint is None else jnp.where(of_joint, most, bounds)
+
+    def across(r: Array) -> Array:
+        return split(n, r)[1]
+
+    if most is None:
+        return across, bounds
+    of_joint = jnp.isfinite(most)
+    return lambda r: jnp.where(of_joint[:, None], r, across(r)), jnp.where(of_joint, most, bounds)
 
 
 def slips(part: Callable, strikes: Strikes, target: Array, T: Array) -> tuple[Array, Array]:
