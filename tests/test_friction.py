@@ -8,6 +8,7 @@ from closed_form import vector, with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid import so3
 from diffrigid.state import rotations
 
 G = 9.81
@@ -58,6 +59,27 @@ def test_block_on_a_slope(case):
     if case[1] == 0.0:  # at the start on the switch from rest to slip: only the slopes by mu and the angle exist
         slopes, true_slopes = (slopes[0], slopes[2]), (true_slopes[0], true_slopes[2])
     assert_allclose(slopes, true_slopes, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_block_on_a_slope_in_space():
+    """Thrown up a slope that rises in no plane of the world, it stops within a step and slides back."""
+
+    def motion(mu, v, slope):
+        ahead = vector(jnp.cos(0.7), jnp.sin(0.7), 0.0)
+        up = jnp.cos(slope) * ahead + vector(0.0, 0.0, jnp.sin(slope))
+        normal = vector(0.0, 0.0, jnp.cos(slope)) - jnp.sin(slope) * ahead
+        q = so3.compose(so3.exp(vector(0.0, 0.0, 0.7)), so3.exp(vector(0.0, -slope, 0.0)))
+        body = dr.Body(dr.Box(half=(0.5, 0.4, 0.3)), mass=1.3, x=0.3 * normal, q=q, v=v * up)
+        hill = dr.Static(dr.HalfSpace(normal=normal))
+        world, state = dr.scene({"block": body, "hill": hill}, gravity=(0.0, 0.0, -G), friction=mu)
+        return dr.rollout(world, state, dt=1 / 60, steps=30).state.x[-1, 0] @ up
+
+    p = tuple(map(jnp.asarray, (0.3, 1.3, 0.5)))
+    distance, slopes = jax.jit(with_slopes(motion))(*p)
+    expected, true_slopes = with_slopes(lambda mu, v, slope: block_in_closed_form(mu, v, slope, 0.5))(*p)
+    assert_allclose(distance, expected, atol=1e-9)
+    assert_allclose(slopes, true_slopes, atol=1e-5)
 
 
 @jax.jit

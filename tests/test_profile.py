@@ -92,13 +92,14 @@ def bounced(points, x, e, t, radius):
     return x + 0.5 * s**2 * down + v * (t - s) + 0.5 * (t - s) ** 2 * down
 
 
-def test_a_disc_bounces_off_a_segment():
-    """Slopes by the points of the profile, by where it falls and by its restitution; in reverse mode."""
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+def test_a_disc_bounces_off_a_segment(mode):
+    """Slopes by the points of the profile, by where it falls and by its restitution."""
     points = jnp.array([(-2.0, 0.1), (0.3, 0.5), (2.0, 2.0)])
     arguments, disc = (points, vector(-0.7, 1.0), jnp.asarray(0.6), jnp.asarray(0.7)), dr.Disc(radius=0.1)
 
     def both(fn):
-        return jax.jit(with_slopes(fn, jax.jacrev))(*arguments)
+        return jax.jit(with_slopes(fn, mode))(*arguments)
 
     got = both(lambda points, x, e, t: end(disc, points, x, vector(0.0, 0.0), e, 0.0, t))
     expected = both(lambda points, x, e, t: bounced(points, x, e, t, 0.1))

@@ -44,13 +44,14 @@ def check_with_slopes(got, expected, arguments, derivative=jax.jacfwd, atol=EXAC
     assert_allclose(slopes, jax.jacfwd(expected, which)(*numbers), atol=atol)
 
 
-def test_a_motor_reaches_its_speed_and_dry_friction_stops_it():
-    """By I dw / torque, which falls inside a step. Friction is a motor of speed 0. In reverse mode."""
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.grad, marks=pytest.mark.slow)])
+def test_a_motor_reaches_its_speed_and_dry_friction_stops_it(mode):
+    """By I dw / torque, which falls inside a step. Friction is a motor of speed 0."""
     check_with_slopes(
         lambda w, speed, torque: turned(wheel(w, friction=torque, speed=speed), 2.0)[0],
         lambda w, speed, torque: 2.0 * speed + INERTIA * (w - speed) * jnp.abs(w - speed) / (2 * torque),
         (1.7, 0.3, 0.473),
-        jax.grad,
+        mode,
     )
 
 
