@@ -185,9 +185,9 @@ def test_a_block_slides_into_another(mode):
     """They meet within a step: places and slopes of closed form."""
     p = jax.tree.map(jnp.asarray, {"v": 1.6, "m": 0.5, "way": 0.13, "mu": 0.3, "e": 0.6})
     places, slopes = jax.jit(with_slopes(slides_into, mode))(p)
-    assert_allclose(places, slides_into_in_closed_form(p), atol=1e-7)
+    assert_allclose(places, slides_into_in_closed_form(p), atol=1e-9)
     for name, true_slope in jax.jacfwd(slides_into_in_closed_form)(p).items():
-        assert_allclose(slopes[0][name], true_slope, atol=1e-4)  # both stop within a step
+        assert_allclose(slopes[0][name], true_slope, atol=1e-6)  # both stop within a step
 
 
 def test_a_ball_that_rests_is_struck():
