@@ -200,6 +200,6 @@ def test_friction_turns_back_with_the_motion():
         return (-1.0) ** half * swing
 
     p = tuple(map(jnp.asarray, (40.0, 2.0, 1.0)))
-    value, slopes = jax.jit(jax.value_and_grad(place, (0, 1, 2)))(*p)
+    value, slopes = jax.jit(with_slopes(place))(*p)
     assert_allclose(value, expected(*p), atol=5e-5)
     assert_allclose(slopes, jax.grad(expected, (0, 1, 2))(*p), atol=5e-5)
