@@ -55,6 +55,15 @@ def test_a_motor_reaches_its_speed_and_dry_friction_stops_it(mode):
     )
 
 
+@pytest.mark.slow
+def test_a_limit_of_a_joint_that_does_not_rub_is_struck_at_its_time():
+    check_with_slopes(
+        lambda w, upper, e: turned(wheel(w, upper=upper, restitution=e), 1.0)[0],
+        lambda w, upper, e: upper - e * (w - upper),
+        (1.7, 1.0, 0.6),
+    )
+
+
 @jax.jit
 @with_slopes
 def after_two_seconds(w, upper, e, torque):

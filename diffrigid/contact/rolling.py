@@ -15,7 +15,7 @@ from jax import Array
 
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.impulse import sticking_impulse
-from diffrigid.contact.mobility import Mobility, momentum_changes, relative_changes, velocities
+from diffrigid.contact.mobility import Mobility, moved
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders
 from diffrigid.contact.slipping import STICKS, lost_to_stops, stopping_early
@@ -97,7 +97,7 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: A
     pair = rows_of(strikes)
     start = pair.v_rel - turning(spin, T)[:, None] * pair.pull
     rest = P - _with_reaction(mobility, strikes, sticks, torque)
-    at_end = pair.v_rel + turning(spin, _changes(mobility, strikes, rest))
+    at_end = pair.v_rel + turning(spin, moved(rest, strikes, mobility))
     load = jax.vmap(dot)(strikes.normal, P)[: len(spin)]
     lost = jnp.zeros_like(torque)
     parts = [(_about, spin * load), (_across, turning(spin, mu) * load)]
@@ -122,12 +122,6 @@ def _across(n: Array, r: Array) -> Array:
     return split(n, r)[1]
 
 
-def _changes(mobility: Mobility, strikes: Strikes, P: Array) -> Array:
-    """Changes of the relative velocities by impulses, (C, D, *batch)."""
-    dv, dw, _ = velocities(mobility, *momentum_changes(strikes, P, mobility.inverse_mass.shape[0]))
-    return relative_changes(strikes, dv, dw)
-
-
 def _sticks(strikes: Strikes, P: Array, mu: Array) -> Array:
     """1 for contacts that do not slip, (K, *batch)."""
     P_n, P_t = (part[: len(strikes.spin)] for part in split(strikes.normal, P))
@@ -138,11 +132,11 @@ def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: 
     """Torques of the rows (K, D, *batch), and what keeps their contacts from slipping, (C, D, *batch) [N s]."""
     so, count = rotations(torque.shape[1]), len(torque)
 
-    def moved(side: tuple[int, ...], arm: Array) -> Array:  # velocity of the contact point by the torque
+    def dragged(side: tuple[int, ...], arm: Array) -> Array:  # velocity of the contact point by the torque
         inverse = at_colliders(mobility.inverse_inertia, side[:count], 0.0)
         return jax.vmap(lambda inverse, tau, arm: so.cross(so.apply(inverse, tau[: so.A]), arm))(inverse, torque, arm)
 
-    slip = moved(strikes.a, strikes.arm_a[:count]) + moved(strikes.b, strikes.arm_b[:count])
+    slip = dragged(strikes.a, strikes.arm_a[:count]) + dragged(strikes.b, strikes.arm_b[:count])
     P = jax.vmap(sticking_impulse)(strikes.K[:count], strikes.normal[:count], slip)
     zero = jnp.zeros((len(strikes.a) - 2 * count, *P.shape[1:]), P.dtype)
     return jnp.concatenate([sticks[:, None] * P, torque, zero])
@@ -151,7 +145,7 @@ def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: 
 def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
     """`stopping_early` of contacts and rows of joints; to them the torques are a pull that acts evenly."""
     spin, count = strikes.spin, len(strikes.spin)
-    by_torque = _changes(mobility, strikes, put(spin, jnp.zeros_like(P), turning(spin, P)))
+    by_torque = moved(put(spin, jnp.zeros_like(P), turning(spin, P)), strikes, mobility)
     pull = strikes.pull + by_torque / jnp.where(T > 0, T, 1.0)[:, None]
 
     def others(values: Any) -> Any:
