@@ -14,14 +14,17 @@ spinning_friction.
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from diffrigid import so2
-from diffrigid.convert import nearest
+from diffrigid.convert import Numbers, known, nearest, numbers
 from diffrigid.forces import Gravity
 from diffrigid.joints import Revolute
 from diffrigid.pytree import array_fields, letters_of, replace
+from diffrigid.shapes import traced
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
 
@@ -57,9 +60,9 @@ def read(world: World, state: State, path: str) -> Array:
     leaf: Any = (world, state)
     for key in place.chain:
         leaf = leaf[key] if isinstance(key, int) else getattr(leaf, key)
-    value: Any = leaf if place.row is None else leaf[place.row]
+    value: Any = leaf if place.row is None else _row(leaf, place.row)
     if path in COEFFICIENTS:
-        return value[0]
+        return _row(value, 0)
     return so2.log(value)[0] if place.angle else value
 
 
@@ -148,22 +151,31 @@ def _update(node: Any, chain: tuple, change) -> Any:
 def _set(record: Any, field: str, place: Place, path: str, value: Any) -> Array:
     """The leaf `record.field` with the value put into its place."""
     leaf = getattr(record, field)
-    try:
-        value = jnp.asarray(value, leaf.dtype)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path} is {value!r}: expected numbers.") from error
+    value = numbers(path, value, None, finite=False).astype(leaf.dtype)
     expected, batch = _axes(record, field, place)
     if place.row is None and path in COEFFICIENTS and value.ndim == 0:
-        return jnp.broadcast_to(value, leaf.shape)
+        return _with_rows(leaf, ..., value)
     if value.ndim == 0 and expected == (1,):
         value = value[None]
     if value.shape not in (expected, expected + batch):
         raise ValueError(f"{path} was given the shape {value.shape}: expected {expected}, as `read` returns it.")
-    value = so2.exp(value[None]) if place.angle else value
+    value = known(so2.exp, value[None]) if place.angle else value
     value = value.reshape(value.shape + (1,) * (leaf.ndim - (place.row is not None) - value.ndim))
-    if place.row is None:
-        return jnp.broadcast_to(value, leaf.shape)
-    return leaf.at[place.row].set(jnp.broadcast_to(value, leaf.shape[1:]))
+    return _with_rows(leaf, ... if place.row is None else place.row, value)
+
+
+def _row(leaf: Array, row: int) -> Array:
+    """One row of a leaf; of a known one without compiling anything."""
+    return leaf[row] if traced(leaf) else jax.device_put(np.asarray(leaf)[row])
+
+
+def _with_rows(leaf: Array, rows: Any, value: Numbers) -> Array:
+    """A leaf with some rows changed; a known one without compiling anything."""
+    if traced((leaf, value)):
+        return jnp.asarray(leaf).at[rows].set(value)
+    changed = np.array(leaf)
+    changed[rows] = value
+    return jax.device_put(changed)
 
 
 def _axes(record: Any, field: str, place: Place) -> tuple[tuple[int, ...], tuple[int, ...]]:

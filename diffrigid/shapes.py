@@ -280,7 +280,7 @@ def volume_properties(shape: Shape, dim: int) -> tuple[Array, Array, Array]:
         name = type(shape).__name__
         raise ValueError(f"this {name} is {dimension(shape)}D but dim is {dim}: use a shape of {dim}D.")
     volume, center, second = _moments(shape, dim)
-    spread = jnp.trace(second)
+    spread = (second * np.eye(dim, dtype=second.dtype)).sum()
     return volume, center, spread if dim == 2 else spread * np.eye(3, dtype=second.dtype) - second
 
 

@@ -111,10 +111,8 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
         weights=stacked(lambda k, name: known(found[k], name).astype(float)),
         width=None,
     )
-    data = jax.tree.map(
-        lambda a: jnp.asarray(a.astype(dtype if np.issubdtype(a.dtype, np.floating) else np.int32)), data
-    )
-    return Group(Plan(here, clocked, priors), data, members)
+    data = jax.tree.map(lambda a: a.astype(dtype if np.issubdtype(a.dtype, np.floating) else np.int32), data)
+    return Group(Plan(here, clocked, priors), jax.device_put(data), members)
 
 
 def _absent(slot: Slot) -> Slot:

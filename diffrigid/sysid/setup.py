@@ -93,7 +93,7 @@ def with_noise(problem: Problem, noise: Mapping[str, float], window: float = np.
         weights = {}
         for name, old in group.data.weights.items():
             rows = [_weights(problem.runs[k], name, noise, window, old.shape[0]) for k in group.members]
-            weights[name] = jnp.asarray(np.stack(rows, axis=-1), old.dtype)
+            weights[name] = jax.device_put(np.stack(rows, axis=-1).astype(old.dtype))
         exact = width == 0 and group.data.width is None
         width_now = None if exact else jnp.asarray(width, group.data.lengths.dtype)
         data = group.data._replace(weights=weights, width=width_now)
@@ -176,7 +176,7 @@ def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
         own.append(np.concatenate(rows) if rows else first_own)
     dtype = problem.runs[0].state.x.dtype
     # Everywhere from the beginning: what a solver returns is, and else all would be compiled again for that.
-    return everywhere(Numbers(*(jnp.asarray(np.stack(rows, -1).astype(dtype)) for rows in (shared, own))))
+    return everywhere(Numbers(*(jax.device_put(np.stack(rows, -1).astype(dtype)) for rows in (shared, own))))
 
 
 def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
@@ -188,7 +188,7 @@ def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
         parts.append(_joined([np.full(slot.size, np.inf if r else 2.0) for slot, r in zip(slots, real, strict=True)]))
     parts[0][list(held)] = 0.0
     a, b = (part.astype(dtype) for part in parts)
-    return Numbers(jnp.asarray(a[:, None]), jnp.asarray(b[:, None, None]))
+    return Numbers(jax.device_put(a[:, None]), jax.device_put(b[:, None, None]))
 
 
 def _value(problem: Problem, slot: Slot) -> Any:
@@ -256,7 +256,7 @@ def fitted_scenes(problem: Problem, shared: np.ndarray, own: np.ndarray) -> list
 def fitted_scene(problem: Problem, group: Group, k: int, shared: np.ndarray, own: np.ndarray) -> Scene:
     """Of record k of a group."""
     run = problem.runs[group.members[k]]
-    z = jnp.asarray(np.concatenate([shared, own[:, group.members[k]]]), run.state.x.dtype)
+    z = np.concatenate([shared, own[:, group.members[k]]]).astype(run.state.x.dtype)
     return _put(group.plan.slots, scene_of(run), z)
 
 
