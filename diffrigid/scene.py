@@ -179,7 +179,7 @@ def scene(
     _warn_of_overlap(made, start, shapes, solids)
     if not traced((made, start)):
         warn_of_torn_joints(made, start)
-    return jax.device_put((made, start))
+    return jax.tree.map(jax.device_put, (made, start))
 
 
 # ---- names and dimension

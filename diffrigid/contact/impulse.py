@@ -43,7 +43,7 @@ def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -
 
 
 def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
-    """K, (D, D, *batch) [1/kg]: change of the relative velocity, at the arms of the end, for a unit impulse."""
+    """K, (D, D, *batch) [1/kg]: change of the relative velocity, at the arms of the end, for a unit impulse there."""
     K: Any = 0.0
     for at, arm, mid in ((at_a, lever.arm_a, lever.mid_a), (at_b, lever.arm_b, lever.mid_b)):
         if at.v is not None:
@@ -51,7 +51,9 @@ def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
             unit = jnp.eye(dim, dtype=at.x.dtype).reshape(dim, dim, *[1] * (at.x.ndim - 1))
             turned = rotations(dim).mobility(at.inverse_inertia, arm, arm if mid is None else mid)
             K = K + at.inverse_mass[None, None] * unit + turned
-    return K
+    if lever.turn is None:
+        return K
+    return K - jax.vmap(lambda row: rotations(len(K)).cross(lever.turn, row))(K)
 
 
 def times(K: Array, P: Array) -> Array:

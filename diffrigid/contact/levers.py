@@ -1,8 +1,9 @@
 """Where a contact acts on its two bodies: at the end of the time that it is held for, and in the middle of it.
 
 A resting force acts evenly over that time T, so its impulse at the middle. There the bodies and their contact were
-elsewhere, at p - (T/2) p' and x - (T/2) v: impulses have the arms of the middle, which keeps angular momentum, and
-what they have to hold is the velocity at the arms of the end. With both at the end, what tips over is of first order.
+elsewhere, at p - (T/2) p' and x - (T/2) v, and the normal was n - (T/2) n': impulses have the arms and the direction of
+the middle, which keeps angular momentum, and what they have to hold is the velocity at the arms of the end, along the
+normal of the end. With all at the end, what tips over, or slides over a round body, is of first order.
 """
 
 from typing import Any
@@ -26,6 +27,7 @@ class Levers:
     arm_b: Array = array("D")
     mid_a: Any = array("D", default=None)  # in the middle; None: the same
     mid_b: Any = array("D", default=None)
+    turn: Any = array("A", default=None)  # [rad] of the normal, from the end back to the middle; None: none
     rate: Any = array("D", default=None)  # [m/s] of the point of contact; None: not known
 
 
@@ -52,7 +54,9 @@ def levers(contact: Contacts, moving: Contacts | None, at_a: Placed, at_b: Place
     size: Any = sum(dot(arm, arm) for arm, at in zip(ends, (at_a, at_b), strict=True) if at.v is not None)
     # No further than arms are long: what turns faster than steps resolve is not to turn them around.
     turned = safe_divide(size, size + 4.0 * dot(turned, turned))[None] * turned
-    return Levers(arm_a=ends[0], arm_b=ends[1], mid_a=mids[0] - turned, mid_b=mids[1] - turned, rate=rate)
+    turn = -half * rotations(len(normal)).moment(normal, moving.normal)
+    turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
+    return Levers(arm_a=ends[0], arm_b=ends[1], mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate)
 
 
 def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tuple[Contacts, Contacts]:

@@ -29,6 +29,7 @@ class Arms:
     arm_b: Array = array("C", "D")
     mid_a: Any = array("C", "D", default=None)  # where impulses act; None: where velocities are, at the arms
     mid_b: Any = array("C", "D", default=None)
+    turn: Any = array("C", "A", default=None)  # [rad] by which they act turned
     jac: Any = array("R", "2", "D + A", default=None)  # of each coordinate by the twists of a and b
     spin: Any = array("K", default=None)
     a: tuple[int, ...] = static()
@@ -55,6 +56,8 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
     points, along, every = _points(arms), P[len(P) - _rows(arms) :, :1], P
     P = P[:points]
     mid_a, mid_b = mids(arms)
+    if arms.turn is not None:
+        P = P + jax.vmap(so.cross)(arms.turn[:points], P)
     push, moments = ([P], [-P]), tuple([jax.vmap(so.moment)(arm[:points], P)] for arm in (mid_a, -mid_b))
     if arms.spin is not None:
         for sign, pushes, turns in zip((1.0, -1.0), push, moments, strict=True):
@@ -197,6 +200,8 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
 
     J_a, J_b = by_units(arms.arm_a, 0), by_units(arms.arm_b, 1)
     mid_a, mid_b = (J_a, J_b) if arms.mid_a is None else (by_units(arm, side) for side, arm in enumerate(mids(arms)))
+    if arms.turn is not None:  # P + turn x P, by the velocities that it acts on
+        mid_a, mid_b = (J - jax.vmap(jax.vmap(so.cross, (None, 0)))(arms.turn, J) for J in (mid_a, mid_b))
 
     def answers(J):  # of each contact to unit twists of one of its bodies: impulses
         return jnp.swapaxes(jax.vmap(answer)(jnp.swapaxes(J, 0, 1)), 0, 1)

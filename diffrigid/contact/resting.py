@@ -28,6 +28,7 @@ class Strikes:
         "C", "D", default=None
     )  # [m] where the impulse acts, half of the time before s; None: at the arm
     mid_b: Any = array("C", "D", default=None)
+    turn: Any = array("C", "A", default=None)  # [rad] from the impulse at s to what acts there; None: none
     K: Array = array("C", "D", "D")  # [1/kg] effective matrix
     v_rel: Array = array("C", "D")  # [m/s] of a against b at the contact point, before the impulse
     pull: Array = array("C", "D")  # [m/s^2] acceleration of a against b there
@@ -73,8 +74,8 @@ def solve_impulses(strikes: Strikes, law: Law, mobility: Mobility, crowd: Array,
         target=target, mu=mu, most=most, spin=strikes.spin, rest_speed=rest_speed,
     )  # fmt: skip
     arms = Arms(
-        arm_a=strikes.arm_a, arm_b=strikes.arm_b, mid_a=strikes.mid_a, mid_b=strikes.mid_b, jac=strikes.jac,
-        spin=strikes.spin, a=strikes.a, b=strikes.b,
+        arm_a=strikes.arm_a, arm_b=strikes.arm_b, mid_a=strikes.mid_a, mid_b=strikes.mid_b, turn=strikes.turn,
+        jac=strikes.jac, spin=strikes.spin, a=strikes.a, b=strikes.b,
     )  # fmt: skip
     return alone + solve_without_gain(cone, strikes.v_rel, arms, mobility)
 

@@ -50,8 +50,10 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1])
         jac = stops.jac
-        mid = stops.arm_a if is_loaded(world) else None
-        parts.append(replace(stops, jac=None, mid_a=mid, mid_b=mid))
+        if is_loaded(world):
+            turn = jnp.zeros_like(stops.arm_a[:, : rotations(world.dim).A])
+            stops = replace(stops, mid_a=stops.arm_a, mid_b=stops.arm_a, turn=turn)
+        parts.append(replace(stops, jac=None))
     if len(parts) > 1:
         strikes = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
     else:
@@ -107,9 +109,9 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array, loaded: bool) -> S
         touching = (gap > 0) & (gap <= meeting.slack)  # open by no more than rounding
         return Strikes(
             active=gap < 0, s=s, gap=jnp.where(touching, 0.0, gap), normal=contact.normal, arm_a=lever.arm_a,
-            arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, K=effective_matrix(at_a, at_b, lever),
-            v_rel=relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b), pull=pull, drift=drift, rests=gap < 0,
-            now=meeting.now, held=held,
+            arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
+            K=effective_matrix(at_a, at_b, lever), v_rel=relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b),
+            pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip
 
     return replace(jax.vmap(each)(contacts, moving), active=active, rests=meeting.rests)
