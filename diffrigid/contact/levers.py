@@ -31,12 +31,15 @@ class Levers:
     rate: Any = array("D", default=None)  # [m/s] of the point of contact; None: not known
 
 
-def levers(contact: Contacts, moving: Contacts | None, at_a: Placed, at_b: Placed, drift: Array, T: Array) -> Levers:
+def levers(
+    contact: Contacts, moving: Contacts | None, turns: bool, at_a: Placed, at_b: Placed, drift: Array, T: Array
+) -> Levers:
     """Levers of one contact.
 
     Args:
         contact: one of a pair, with the gap that it has closed by while it was held, else 0.
         moving: its rates. None: all arms are those in the middle, of a point that moves as the centres do in the mean.
+        turns: whether the normal may turn.
         drift: (D, *batch) [m/s] half the velocity of a against b, of the centres; 0 at a static.
         T: (*batch) [s] for which it is held, else 0.
     """
@@ -54,8 +57,10 @@ def levers(contact: Contacts, moving: Contacts | None, at_a: Placed, at_b: Place
     size: Any = sum(dot(arm, arm) for arm, at in zip(ends, (at_a, at_b), strict=True) if at.v is not None)
     # No further than arms are long: what turns faster than steps resolve is not to turn them around.
     turned = safe_divide(size, size + 4.0 * dot(turned, turned))[None] * turned
-    turn = -half * rotations(len(normal)).moment(normal, moving.normal)
-    turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
+    turn = None
+    if turns:
+        turn = -half * rotations(len(normal)).moment(normal, moving.normal)
+        turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
     return Levers(arm_a=ends[0], arm_b=ends[1], mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate)
 
 

@@ -50,7 +50,7 @@ def with_rows(
     pull = jnp.zeros_like(w) if flight.tau is None else jax.vmap(so.apply)(mobility.inverse_inertia, flight.tau)
     along = jax.vmap(lambda n: unit_vector(n, 0) if flat else n)(strikes.normal[:count])
     none = jnp.zeros_like(along)
-    mid, turn = (None, None) if strikes.mid_a is None else (none, none[:, : so.A])
+    mid, turn = None if strikes.mid_a is None else none, None if strikes.turn is None else none[:, : so.A]
     rows = Strikes(
         active=strikes.active[:count], s=strikes.s[:count], gap=zero, normal=along, arm_a=none, arm_b=none,
         mid_a=mid, mid_b=mid, turn=turn, K=_mobility_of_turns(mobility, a, b, so), v_rel=kick * turns(w),

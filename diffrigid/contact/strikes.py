@@ -50,15 +50,19 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1])
         jac = stops.jac
-        if is_loaded(world):
-            turn = jnp.zeros_like(stops.arm_a[:, : rotations(world.dim).A])
-            stops = replace(stops, mid_a=stops.arm_a, mid_b=stops.arm_a, turn=turn)
-        parts.append(replace(stops, jac=None))
-    if len(parts) > 1:
-        strikes = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
-    else:
-        strikes = parts[0]
-    return replace(strikes, **ends(world), jac=jac)
+        mid = stops.arm_a if is_loaded(world) else None
+        parts.append(replace(stops, jac=None, mid_a=mid, mid_b=mid))
+    return replace(_joined(parts), **ends(world), jac=jac)
+
+
+def _joined(parts: list[Strikes]) -> Strikes:
+    """All in one list; where some turn, all have how far."""
+    if len(parts) == 1:
+        return parts[0]
+    if any(part.turn is not None for part in parts):
+        none = [jnp.zeros_like(part.arm_a[:, : rotations(part.arm_a.shape[1]).A]) for part in parts]
+        parts = [replace(p, turn=zero) if p.turn is None else p for p, zero in zip(parts, none, strict=True)]
+    return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
 
 
 def waits(world: Any) -> bool:
@@ -98,11 +102,11 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array, loaded: bool) -> S
     active = (near | (meeting.rests & held[None])) & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
-    T = jnp.where(held, s - began(a, b), 0.0)
+    T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
 
     def each(contact: Contacts, moving: Contacts | None) -> Strikes:
         gap = contact.gap
-        lever = levers(replace(contact, gap=jnp.where(held, gap, 0.0)), moving, at_a, at_b, drift, T)
+        lever = levers(replace(contact, gap=jnp.where(held, gap, 0.0)), moving, turns, at_a, at_b, drift, T)
         arms = (a, at_a, lever.arm_a), (b, at_b, lever.arm_b)
         pulls: list[Any] = [acceleration(side, at, s, arm, lever.rate) for side, at, arm in arms]
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
