@@ -13,11 +13,12 @@ from jax import Array, lax
 from diffrigid.compiling import uncollected
 from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
-from diffrigid.convert import largest, numbers
+from diffrigid.convert import Numbers, largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import opaque_true, with_tangents
 from diffrigid.pytree import align, array, batch_rank, pytree
+from diffrigid.shapes import traced
 from diffrigid.state import State
 from diffrigid.world import World, check, check_kinds
 
@@ -146,18 +147,23 @@ def missed_pairs(world: World, state: State, dt: Any) -> Array:
 def floats(world: World, state: State) -> tuple[World, State]:
     """Every leaf as an array of the type of state.x, so that a Python number does not trace anew."""
     dtype = jnp.result_type(state.x)
-    return jax.tree.map(lambda leaf: lax.convert_element_type(jnp.asarray(leaf), dtype), (world, state))
+
+    def converted(leaf: Any) -> Array:
+        ready = isinstance(leaf, Array) and leaf.dtype == dtype and not leaf.weak_type
+        return leaf if ready else lax.convert_element_type(jnp.asarray(leaf), dtype)
+
+    return jax.tree.map(converted, (world, state))
 
 
-def step_length(dt: Any, state: State, batch: bool = False) -> Array:
+def step_length(dt: Any, state: State, batch: bool = False) -> Numbers:
     """dt as an array of the type of the state, checked where it is known; a number unless it may be of a `batch`."""
-    array = jnp.asarray(numbers("dt", dt, None, finite=False), state.x.dtype)
+    length = numbers("dt", dt, None, finite=False).astype(state.x.dtype)
     allowed = state.x.shape[2:] if batch else ()
-    if array.ndim and array.shape != allowed:
-        raise ValueError(f"dt has shape {array.shape}, expected a number" + batch * f" or {allowed} like the batch")
-    if not isinstance(array, jax.core.Tracer) and not ((np.asarray(array) > 0) & (array < largest(array.dtype))).all():
-        raise ValueError(f"dt is {array}, expected > 0 [s] and finite")
-    return array
+    if length.ndim and length.shape != allowed:
+        raise ValueError(f"dt has shape {length.shape}, expected a number" + batch * f" or {allowed} like the batch")
+    if not traced(length) and not ((length > 0) & (length < largest(length.dtype))).all():
+        raise ValueError(f"dt is {length}, expected > 0 [s] and finite")
+    return length
 
 
 def at_least_one(name: str, count: Any) -> int:

@@ -1,7 +1,9 @@
 """`World`: everything that a step does not change, and the checks of shape and type."""
 
+import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -101,7 +103,7 @@ def shape_of_leaf(leaf: Any, path: str) -> tuple[int, ...]:
         raise ValueError(f"{path} is a {type(leaf).__name__}: expected an array; convert it with jnp.asarray.")
     if isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biuf":
         raise ValueError(f"{path} has type {leaf.dtype}: expected floating point.")
-    return jnp.shape(leaf)
+    return leaf.shape if hasattr(leaf, "shape") else ()
 
 
 def check(world: World, state: State) -> None:
@@ -113,6 +115,20 @@ def check(world: World, state: State) -> None:
         ValueError: state.w has shape (1, 3), expected (N=1, A=1, *batch) in this 2D world of 1 bodies: ...
     """
     check_kinds(world, state)
+    leaves, tree = jax.tree.flatten((world, state))
+    if all(isinstance(leaf, Array) for leaf in leaves):
+        _check_alike(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+    else:
+        _check_leaves(world, state)
+
+
+@functools.lru_cache
+def _check_alike(tree: Any, leaves: tuple) -> None:
+    """`check`, once for all that have the same structure, shapes and types."""
+    _check_leaves(*jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves]))
+
+
+def _check_leaves(world: World, state: State) -> None:
     refuse_missing(state, "state")
     sizes = axis_sizes(world)
     batches: dict[tuple[int, ...], str] = {}
