@@ -27,7 +27,7 @@ from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import restitution_at
 from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
 from diffrigid.contact.known import Known
-from diffrigid.contact.resting import Law
+from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders
 from diffrigid.contact.strikes import (
     coefficients,
@@ -149,39 +149,15 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, known:
     impact, turn, push = (phase == kind for kind in (IMPACT, TURN, PUSH))
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
-    restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
-    drives = _flags(driven(world), dt[None])
-    u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
-    if world.bodies.restitution_falloff is not None:
-        restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
-    slow = u <= world.contact.rest_speed[None]
-    closing = -jax.vmap(dot)(strikes.normal, strikes.pull)
-    rests = slow | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
-    falls = u <= world.contact.rest_speed[None] + 2.0 * jnp.maximum(_fall(flight, dt)[None], closing * dt[None])
-    held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | falls)
-    found = resting | held | (strikes.active & ~strikes.held & (slow | (strikes.now & rests)))
-    held = jnp.where(push, resting & ~drives, held)
-    now, resting = held | (strikes.active & strikes.now), jnp.where(impact, found, jnp.where(turn, resting, held))
+    strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
     if known is not None:
         skips = turn & ~known.turns()
-        now, unused = now & ~skips[None], skips | (push & ~known.opened(strikes.gap))
-    began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
-    held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
-    # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
-    may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(strikes.gap, 0.0), held_for), 0.0)
-    at_rest = jnp.where(push | (strikes.gap <= 0), 0.0, may_close)
-    target = jnp.where(held, at_rest, jnp.where(rests, 0.0, restitution * u))
-    target, force = driving(world, target)
-    v_rel = jnp.where(push, strikes.gap[:, None] * strikes.normal, strikes.v_rel)
-    strikes = replace(strikes, active=now, held=held, v_rel=v_rel)
+        unused = skips | (push & ~known.opened(strikes.gap))
+        strikes = replace(strikes, active=strikes.active & ~skips[None])
 
     def strike(anchors, known):
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
-        most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
-        mu = jnp.where(push, 0.0, friction)
-        applied = functools.partial(
-            apply_impulses, world, anchors, flight, strikes, Law(target, mu, most), kick, held_for
-        )
+        applied = functools.partial(apply_impulses, world, anchors, flight, strikes, law, kick, held_for)
         if known is None:
             return applied(None)[0], None
         nothing = jax.tree.map(jnp.zeros_like, known)
@@ -191,9 +167,39 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, known:
         following = replace(turns, P=jnp.where(waits, turns.P, load))
         return _choice(waits, anchors, after), _choice(skips, known, following)
 
-    any_now = some(now)
+    any_now = some(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
     return anchors, resting, known, any_now, some(resting | strikes.rests)
+
+
+def _demanded(
+    world: Any, anchors: Anchors, flight: Flight, strikes: Strikes, resting: Array, dt: Array, phase: Array
+) -> tuple[Strikes, Law, Array, Array]:
+    """What contacts demand in a pass: which take part, their law, for how long [s] they are held, and which rest."""
+    impact, turn, push = (phase == kind for kind in (IMPACT, TURN, PUSH))
+    drives = _flags(driven(world), dt[None])
+    restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
+    u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
+    if world.bodies.restitution_falloff is not None:
+        restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
+    slow = u <= world.contact.rest_speed[None]
+    closing = -jax.vmap(dot)(strikes.normal, strikes.pull)
+    rests = slow | strikes.rests | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
+    falls = u <= world.contact.rest_speed[None] + 2.0 * jnp.maximum(_fall(flight, dt)[None], closing * dt[None])
+    held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | falls)
+    found = resting | held | (strikes.active & ~strikes.held & (slow | (strikes.now & rests)))
+    held = jnp.where(push, resting & ~drives, held)
+    now, resting = held | (strikes.active & strikes.now), jnp.where(impact, found, jnp.where(turn, resting, held))
+    began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
+    held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
+    # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
+    may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(strikes.gap, 0.0), held_for), 0.0)
+    at_rest = jnp.where(push | (strikes.gap <= 0), 0.0, may_close)
+    target, force = driving(world, jnp.where(held, at_rest, jnp.where(rests, 0.0, restitution * u)))
+    most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
+    v_rel = jnp.where(push, strikes.gap[:, None] * strikes.normal, strikes.v_rel)
+    law = Law(target, jnp.where(push, 0.0, friction), most)
+    return replace(strikes, active=now, held=held, v_rel=v_rel), law, held_for, resting
 
 
 def _choice(chosen: Array, new: Any, old: Any) -> Any:
