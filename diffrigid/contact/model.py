@@ -184,7 +184,7 @@ def _demanded(
         restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
     slow = u <= world.contact.rest_speed[None]
     closing = -jax.vmap(dot)(strikes.normal, strikes.pull)
-    rests = slow | strikes.rests | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
+    rests = slow | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
     falls = u <= world.contact.rest_speed[None] + 2.0 * jnp.maximum(_fall(flight, dt)[None], closing * dt[None])
     held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | falls)
     found = resting | held | (strikes.active & ~strikes.held & (slow | (strikes.now & rests)))
