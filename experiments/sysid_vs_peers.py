@@ -20,7 +20,7 @@ Result (2026-11-22, 40 records; mujoco 4.0.0, pymunk 7.3.1, pyb2d3 0.11.1, scipy
 AMD EPYC beside other work, so CPU-seconds are good to some tens of per cent):
 
                                      success  in interval  error e, mass     CPU-s: answer, one fit more
-    diffrigid                           98 %        95 %    0.0005  0.0008      11.4     0.23
+    diffrigid                           98 %        95 %    0.0005  0.0008      10.4     0.22
     diffrigid, exact impacts only       98 %        96 %    0.0004  0.0008      10.4     0.08
     mujoco.sysid, as it comes            0 %          -                         41.8     4.87
     mujoco.sysid, large differences     45 %        40 %    0.0026  0.0036      50.0     6.43

@@ -7,7 +7,7 @@ Jacobian, side by side on the last axis, so that what is compiled does not grow 
 are arguments of what is compiled: another record of the same shape costs no compilation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from diffrigid.compiling import QUICK, uncollected
+from diffrigid.compiling import QUICK, QUICKEST, uncollected
 from diffrigid.devices import cut, devices, everywhere, join, over_devices, pieces_of
 from diffrigid.pytree import replace
 from diffrigid.state import State
@@ -29,6 +29,7 @@ from diffrigid.sysid.sensors import Part, difference
 from diffrigid.sysid.times import controls_over, grid
 
 LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are looked at
+LITTLE = 20_000  # steps of all records, starts and directions, up to which compiling takes longer than running a fit
 
 
 @dataclass(frozen=True)
@@ -248,8 +249,24 @@ def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
     return residuals(plan, z.reshape(n, -1), _spread(data, 1, S)).reshape(-1, R, S)
 
 
-linearise = uncollected(jax.jit(linearised, static_argnames="plan", compiler_options=QUICK))
-evaluate = uncollected(jax.jit(residuals_of, static_argnames="plan", compiler_options=QUICK))
+def _compiled(fn: Callable) -> tuple[Callable, ...]:
+    """`fn` compiled as soon as can be, and to run sooner."""
+    return tuple(
+        uncollected(jax.jit(fn, static_argnames="plan", compiler_options=options)) for options in (QUICKEST, QUICK)
+    )
+
+
+LINEARISE, EVALUATE = map(_compiled, (linearised, residuals_of))
+
+
+def linearise(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
+    """`linearised`, compiled as suits the work that it is."""
+    return LINEARISE[z.size * len(data.lengths) > LITTLE](plan, z, data)
+
+
+def evaluate(plan: Plan, z: Array, data: Data) -> Array:
+    """`residuals_of`, likewise."""
+    return EVALUATE[z.size * len(data.lengths) > LITTLE](plan, z, data)
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:
