@@ -21,7 +21,7 @@ AMD EPYC beside other work, so CPU-seconds are good to some tens of per cent):
 
                                      success  in interval  error e, mass     CPU-s: answer, one fit more
     diffrigid                           98 %        95 %    0.0005  0.0008      10.4     0.22
-    diffrigid, exact impacts only       98 %        96 %    0.0004  0.0008      10.4     0.08
+    diffrigid, exact impacts only       98 %        95 %    0.0004  0.0008       9.7     0.08
     mujoco.sysid, as it comes            0 %          -                         41.8     4.87
     mujoco.sysid, large differences     45 %        40 %    0.0026  0.0036      50.0     6.43
     pymunk, as SciPy comes              60 %        29 %    0.0023  0.0046       1.9     0.16
