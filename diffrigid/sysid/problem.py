@@ -261,12 +261,17 @@ LINEARISE, EVALUATE = map(_compiled, (linearised, residuals_of))
 
 def linearise(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
     """`linearised`, compiled as suits the work that it is."""
-    return LINEARISE[z.size * len(data.lengths) > LITTLE](plan, z, data)
+    return LINEARISE[_is_much(z, data)](plan, z, data)
 
 
 def evaluate(plan: Plan, z: Array, data: Data) -> Array:
     """`residuals_of`, likewise."""
-    return EVALUATE[z.size * len(data.lengths) > LITTLE](plan, z, data)
+    return EVALUATE[_is_much(z, data)](plan, z, data)
+
+
+def _is_much(z: Array, data: Data) -> bool:
+    """Whether to simulate it in the directions of all numbers z takes longer than to compile."""
+    return z.size * len(data.lengths) > LITTLE
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:
