@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+TINY = 6  # rows of a matrix, up to which its elimination is written out
 SMALL = 9  # rows of a matrix, up to which all of a batch at once are faster than a library that takes one by one
 FEW, MANY = 12, 40  # terms of a sum that is written out: where there are many such sums, where there are few
 FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
@@ -275,6 +276,8 @@ def solve_regular(matrix: Array, right: Array) -> Array:
     Zeros where a matrix is singular.
     """
     matrix, right = lax.stop_gradient((matrix, right))
+    if len(matrix) <= TINY and right.shape[1] == 1:
+        return _written_out(matrix, right)
     if len(matrix) <= SMALL:
         return _gauss_jordan(matrix, right)
     # What elimination makes of the right side beside the matrix needs no permutation.
@@ -294,6 +297,23 @@ def identity(like: Array) -> Array:
     """Unit matrices, (R, R, *batch)."""
     size, batch = like.shape[0], like.shape[2:]
     return jnp.eye(size, dtype=like.dtype).reshape(size, size, *[1] * len(batch)) + jnp.zeros_like(like)
+
+
+def _written_out(matrix: Array, right: Array) -> Array:
+    """x of matrix x = right, (R, R, *batch), (R, 1, *batch) -> (R, 1, *batch), without a choice of pivots.
+
+    No choice is needed where the matrix is the product of a block-diagonal one and one with a positive definite
+    symmetric part, as that of a body is but for strong friction. A direction whose pivot is 0 is left out.
+    """
+    system, eliminated = jnp.concatenate([matrix, right], axis=1), []
+    while len(system):
+        pivot = system[0, 0]
+        eliminated.append(system[0, 1:] * safe_divide(jnp.ones_like(pivot), pivot)[None])
+        system = system[1:, 1:] - system[1:, :1] * eliminated[-1][None]
+    x: list[Array] = []
+    for row in reversed(eliminated):
+        x.insert(0, functools.reduce(jnp.subtract, [a * b for a, b in zip(row[:-1], x, strict=True)], row[-1]))
+    return jnp.stack(x)[:, None]
 
 
 def _gauss_jordan(matrix: Array, right: Array) -> Array:

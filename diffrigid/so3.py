@@ -4,13 +4,14 @@ Orientation q = unit quaternion (w, x, y, z), (4, *batch), body to world; in cod
 `w` stays the angular velocity. Vectors, angular velocities and momenta (3, *batch); inertia (3, 3, *batch).
 """
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import components, cos_sin, dot, safe_sqrt
+from diffrigid.numerics import components, cos_sin, dot, safe_sqrt, some
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
@@ -169,6 +170,7 @@ def mobility(inverse: Array, r: Array, mid: Array) -> Array:
     return jnp.swapaxes(cross_rows(mid, jnp.swapaxes(half, 0, 1)), 0, 1)
 
 
+@jax.custom_jvp
 def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
     """Rotation vector, in body axes, after time s, as a power series sum_k turn[k] s^(k+1); (K, 3, *batch).
 
@@ -181,7 +183,31 @@ def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
     Truncated after s^6: the error of one step is of order (w s)^7 / 5040, and none where l is parallel to w.
     Source: Iserles et al., Lie-group methods, Acta Numerica 2000, section 4; Hairer, Lubich, Wanner,
     Geometric Numerical Integration, VII.5.
+
+    Where all bodies turn about a principal axis without torque, as balls and cubes always do, only the first term is
+    computed. Its derivatives are those of the whole series, which other inertias have.
     """
+    if tau is not None:
+        return _whole_series(inverse, q, L, tau)
+    l = unrotate(q, L)
+    w = matrix_product(inverse, l)
+    twist, size = cross(l, w), dot(l, l) * dot(w, w)
+
+    def first(inverse, q, L):
+        del inverse, q, L
+        return jnp.concatenate([w[None], jnp.zeros((SERIES_ORDER - 1, *w.shape), w.dtype)])
+
+    wanders = dot(twist, twist) > (16.0 * jnp.finfo(w.dtype).eps) ** 2 * size
+    return lax.cond(some(wanders), partial(_whole_series, tau=None), first, inverse, q, L)
+
+
+@turn_series.defjvp
+def _turn_series_jvp(primals, tangents):
+    return jax.jvp(_whole_series, primals, tangents)
+
+
+def _whole_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
+    """Terms of `turn_series`, (K, 3, *batch)."""
     l = unrotate(q, L)
     w = matrix_product(inverse, l)
     drives = [l, w] if tau is None else [l, w, unrotate(q, tau)]

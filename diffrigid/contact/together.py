@@ -20,7 +20,7 @@ Bertsekas, Constrained Optimization and Lagrange Multiplier Methods, 1982, for e
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ ROUNDS = 40  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
 ROUGH = 1e-2  # with this relative error, and then with as little as it can
 PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
-SMOOTHING = 3  # rounds after each Newton step
+SMOOTHING = 3  # rounds after a Newton step that gained little
 PATIENCE = 3  # rounds that do not halve a small error: then it is rounding
 REFINEMENTS = 8  # of the linear system of the derivative
 
@@ -144,6 +144,19 @@ def _newton_step(r: Array, solved: Callable, slope: Slope, cone: Cone, arms: Arm
     return direct - _pushed_back(slope, cone, arms, solved(twists(direct, arms, mobility)))
 
 
+class Search(NamedTuple):
+    """How far Newton's method has come in every world of a batch."""
+
+    count: Any  # int: rounds
+    P: Array  # (C, D, *batch) [N s]
+    z: Array  # its `_excess`
+    r: Array  # what is missing: allowed(z) - P
+    best: Array  # of all P
+    error: Array  # (*batch) [m/s] of the best
+    since: Array  # (*batch) int: rounds since the error was halved
+    mark: Array  # (*batch) [m/s] error then
+
+
 @jax.custom_jvp
 def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
     """Impulses of all contacts that take part, (C, D, *batch) [N s]; zero for the others.
@@ -151,68 +164,98 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
     Args:
         shared: bool: there is such a contact in some world of the batch.
         v_rel: (C, D, *batch) [m/s] before the impulses.
-
-    After every Newton step P is brought back into the cones, and made smoother by some rounds in which each contact
-    takes a share of the masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
     """
-    rounding = jnp.finfo(v_rel.dtype).eps
-    least, stuck = rounding**0.6 * cone.rest_speed, 3.0 * rounding**0.5
 
-    def lacks(best, error, since):
-        small = jnp.where(since < 5 * PATIENCE, stuck, jnp.inf)
-        small = jnp.where(since < 2 * PATIENCE, rounding**0.6, small)
-        small = jnp.where(since < PATIENCE, 16.0 * rounding, small)
-        return error > small * speed(best) + least
+    def solved(nothing):
+        P = _smoothed(1, nothing, cone, v_rel, arms, mobility)
+        z, r = _missing(P, cone, v_rel, arms, mobility)
+        error = _speed(cone, r)
+        start = Search(0, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
+        again = functools.partial(_again, given=(cone, v_rel, arms, mobility))
+        return lax.while_loop(lambda now: (now.count < ROUNDS) & some(_lacks(cone, now)), again, start).best
 
-    def busy(carry):
-        return (carry[0] < ROUNDS) & some(lacks(*carry[4:7]))
+    return lax.cond(shared, solved, lambda nothing: nothing, jnp.zeros_like(v_rel))
 
-    def speed(P):
-        return jnp.max(cone.scale[:, None] * jnp.abs(P), (0, 1))
 
+def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
+    """A Newton step, from which P is brought back into the cones.
+
+    Where that does not halve the error, P is made smoother by some rounds in which each contact takes a share of the
+    masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
+    """
+    cone, v_rel, arms, mobility = given
+    slope = _slope(cone, now.z)
+    matrix = bodies_matrix(_answer(slope, cone), arms, mobility)
+    dP = _newton_step(now.r, lambda u: solve_regular(matrix, u[:, None])[:, 0], slope, cone, arms, mobility)
+    P, since = allowed(cone, now.P + dP), now.since
+    z, r = _missing(P, *given)
+
+    def smoothed(P, *_):
+        P = _smoothed(SMOOTHING, P, *given)
+        return P, *_missing(P, *given)
+
+    poor = _lacks(cone, now) & (_speed(cone, r) > 0.5 * now.error)
+    P, z, r = lax.cond(some(poor), smoothed, lambda *kept: kept, P, z, r)
+    if mobility.inverse_mass.shape[0] >= PILE:
+        circles = (now.count > 0) & (now.count % CIRCLES == 0) & some(_circles(cone, now))
+        P, z, r, since = lax.cond(
+            circles, functools.partial(_elsewhere, now, given), lambda *kept: kept, P, z, r, since
+        )
+    size = _speed(cone, r)
+    best, halved = jnp.where((size < now.error)[None, None], P, now.best), size < 0.5 * now.mark
+    since, mark = jnp.where(halved, 0, since + 1), jnp.where(halved, size, now.mark)
+    return Search(now.count + 1, P, z, r, best, jnp.minimum(size, now.error), since, mark)
+
+
+def _elsewhere(now: Search, given: tuple[Cone, Array, Arms, Mobility], P: Array, z: Array, r: Array, since: Array):
+    """Another start, by the method of multipliers, in worlds that go round in circles."""
+    cone, lost = given[0], _circles(given[0], now)
+
+    def wrong(P):
+        return _speed(cone, _missing(P, *given)[1])
+
+    share = jnp.where(now.count > CIRCLES, 0.0, ROUGH).astype(P.dtype)
+    enough = jnp.where(lost, share * _speed(cone, now.best) + _least(cone), jnp.inf)
+    P = jnp.where(lost[None, None], solve_roughly(*given, wrong, enough), P)
+    return P, *_missing(P, *given), jnp.where(lost, 0, since)
+
+
+def _missing(P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> tuple[Array, Array]:
+    """z, and what P lacks to be what is allowed of it; (C, D, *batch) [N s]."""
+    z = _excess(cone, P, v_rel, arms, mobility)
+    return z, allowed(cone, z) - P
+
+
+def _smoothed(rounds: int, P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
     def smoother(_, P):
         z = _excess(cone, P, v_rel, arms, mobility)
         return allowed(cone, P + (z - P) / cone.crowd[:, None])
 
-    def lacking(P):
-        z = _excess(cone, P, v_rel, arms, mobility)
-        return z, allowed(cone, z) - P
+    return lax.fori_loop(0, rounds, smoother, P)
 
-    def circling(best, error):
-        return error > stuck * speed(best) + least
 
-    def roughly(count, P, since, best, error):
-        def wrong(P):
-            return speed(lacking(P)[1])
+def _speed(cone: Cone, P: Array) -> Array:
+    """The largest change of velocity by impulses at their contacts, (*batch) [m/s]."""
+    return jnp.max(cone.scale[:, None] * jnp.abs(P), (0, 1))
 
-        lost, share = circling(best, error), jnp.where(count > CIRCLES, 0.0, ROUGH).astype(v_rel.dtype)
-        enough = jnp.where(lost, share * speed(best) + least, jnp.inf)
-        other = solve_roughly(cone, v_rel, arms, mobility, wrong, enough)
-        return jnp.where(lost[None, None], other, P), jnp.where(lost, 0, since)
 
-    def again(carry):
-        count, P, z, r, best, error, since, mark = carry
-        slope = _slope(cone, z)
-        matrix = bodies_matrix(_answer(slope, cone), arms, mobility)
-        dP = _newton_step(r, lambda u: solve_regular(matrix, u[:, None])[:, 0], slope, cone, arms, mobility)
-        P = lax.fori_loop(0, SMOOTHING, smoother, allowed(cone, P + dP))
-        if mobility.inverse_mass.shape[0] >= PILE:
-            again_now = (count > 0) & (count % CIRCLES == 0) & some(circling(best, error))
-            P, since = lax.cond(again_now, roughly, lambda _, *kept: kept[:2], count, P, since, best, error)
-        z, r = lacking(P)
-        size = speed(r)
-        better = size < error
-        best, halved = jnp.where(better[None, None], P, best), size < 0.5 * mark
-        since, mark = jnp.where(halved, 0, since + 1), jnp.where(halved, size, mark)
-        return count + 1, P, z, r, best, jnp.minimum(size, error), since, mark
+def _least(cone: Cone) -> Array:
+    """An error that is none, (*batch) [m/s]."""
+    return jnp.finfo(cone.scale.dtype).eps ** 0.6 * cone.rest_speed
 
-    def iterate(nothing):
-        P = smoother(0, nothing)
-        z, r = lacking(P)
-        error = speed(r)
-        return lax.while_loop(busy, again, (0, P, z, r, P, error, jnp.zeros_like(error, np.int32), error))[4]
 
-    return lax.cond(shared, iterate, lambda nothing: nothing, jnp.zeros_like(v_rel))
+def _lacks(cone: Cone, now: Search) -> Array:
+    """Whether the best is not yet as good as rounding allows, (*batch) bool: the longer it takes, the less is asked."""
+    rounding = jnp.finfo(now.P.dtype).eps
+    small = jnp.where(now.since < 5 * PATIENCE, 3.0 * rounding**0.5, jnp.inf)
+    small = jnp.where(now.since < 2 * PATIENCE, rounding**0.6, small)
+    small = jnp.where(now.since < PATIENCE, 16.0 * rounding, small)
+    return now.error > small * _speed(cone, now.best) + _least(cone)
+
+
+def _circles(cone: Cone, now: Search) -> Array:
+    """Whether the error of the best is more than of rounding, (*batch) bool."""
+    return now.error > 3.0 * jnp.finfo(now.P.dtype).eps ** 0.5 * _speed(cone, now.best) + _least(cone)
 
 
 @solve_together.defjvp
