@@ -4,6 +4,11 @@ Letters of array axes, everywhere: N bodies, D space (2 or 3), A angular (1 or 3
 S statics, C contacts, P pairs, K contacts of a pair, T time steps; trailing batch axes follow them.
 """
 
+from importlib.metadata import version
+
+from diffrigid import paths as paths
+from diffrigid import sysid as sysid
+from diffrigid import view as view
 from diffrigid.batch import rollout_batch
 from diffrigid.contact import Contact
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
@@ -122,3 +127,9 @@ __all__ = [
     "step",
     "student",
 ]
+
+
+def __getattr__(name: str) -> str:
+    if name == "__version__":
+        return version("diffrigid")
+    raise AttributeError(f"module 'diffrigid' has no attribute {name!r}")

@@ -15,6 +15,7 @@ from jax import lax
 
 from diffrigid.compiling import uncollected
 from diffrigid.controls import as_controls, controlled
+from diffrigid.convert import numbers
 from diffrigid.devices import cut, devices, join, over_devices, pieces_of
 from diffrigid.pytree import map_arrays
 from diffrigid.shapes import Disc, HalfSpace, Sphere
@@ -40,10 +41,10 @@ def rollout_batch(
         controls: values that forces with a `control` add, by its name; held over each step: (T, D or A) for all
             worlds, or (B, T, D or A).
         chunk: worlds that run together; default: as many as fit the cache and `memory`.
-        memory: [bytes] that reverse mode may save on each device. A batch that would need more saves the starts of its
-            chunks, and computes each again; one that still would, the states at every so many steps, as `rollout` does.
+        memory: [bytes] that reverse mode may use for saved states on each device. If a batch needs more, only the start
+            of each chunk is kept and the chunk is computed again; if one chunk needs more, see `rollout`.
 
-    All devices that JAX has share the work, those of other processes too: then every process makes the same call,
+    All JAX devices share the work, those of other processes too: then every process makes the same call,
     and the result lies where it was computed (`jax.experimental.multihost_utils.process_allgather` brings it together).
 
     Raises:
@@ -76,14 +77,17 @@ def rollout_batch(
 def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -> Any:
     """Controls of the whole batch, with the batch last: (T, D or A, B), or 1 where they are alike."""
     if isinstance(controls, Mapping):
-        names = controlled(world.forces)
-        controls = {k: _batch_last(value) if k in names else value for k, value in controls.items()}
+        sizes = controlled(world.forces)
+        controls = {k: _batch_last(k, v, (steps, sizes[k]), count) if k in sizes else v for k, v in controls.items()}
     return as_controls(world.forces, controls, dtype, (steps,), (count,))
 
 
-def _batch_last(value: Any) -> Any:
-    """(B, T, D or A) to (T, D or A, B); what is no batch of arrays stays."""
-    return jnp.moveaxis(value, 0, -1) if getattr(value, "ndim", 0) == 3 else value
+def _batch_last(name: str, value: Any, own: tuple[int, int], count: int) -> Any:
+    """(B, T, D or A) to (T, D or A, B); what is alike for all stays."""
+    array = numbers(f"controls[{name!r}]", value, None)
+    if array.shape not in (own, (count, *own)):
+        raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {own} or {(count, *own)}.")
+    return array if array.ndim == 2 else jnp.moveaxis(jnp.asarray(array), 0, -1)
 
 
 def _check_leaves(world: World, state: State) -> None:

@@ -13,9 +13,9 @@ Result = TypeVar("Result")
 
 
 def uncollected(fn: Callable[Inputs, Result]) -> Callable[Inputs, Result]:
-    """`fn`, during which Python does not look for garbage: for what may trace a program.
+    """`fn` with Python's garbage collector paused, for functions that may trace a program.
 
-    Tracing makes hundreds of thousands of objects that all stay, and looking through them takes a third of its time.
+    Tracing creates hundreds of thousands of objects that all survive; scanning them takes a third of its time.
     """
 
     @functools.wraps(fn)

@@ -15,7 +15,7 @@ import numpy as np
 
 from diffrigid import so2
 from diffrigid.pytree import map_arrays, refuse_missing, replace
-from diffrigid.shapes import dimension, traced, volume_properties, with_topology
+from diffrigid.shapes import HalfSpace, dimension, traced, volume_properties, with_topology
 
 TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: what is typed has a few digits
 FLAT = 1e-9  # [-] of the largest principal inertia: what is smaller has no thickness
@@ -150,10 +150,14 @@ def orientation(name: str, body: Any, dim: int) -> Numbers:
 
 def unit_quaternion(where: str, q: Numbers) -> Numbers:
     """q, (2,) or (4,), of length one to rounding."""
-    length = (jnp if traced(q) else np).sqrt((q * q).sum())
+    length = _length(q)
     if not traced(q) and abs(length - 1) > TYPED:
         raise ValueError(f"{where} has length {length:.6g}: expected 1; divide it by its length.")
     return q / length
+
+
+def _length(vector: Numbers) -> Numbers:
+    return (jnp if traced(vector) else np).sqrt((vector * vector).sum())
 
 
 def angular_velocity(name: str, w: Any, dim: int) -> Numbers:
@@ -180,7 +184,8 @@ def shape_of(name: str, shape: Any, dim: int) -> Any:
     if dimension(shape) not in (None, dim):
         kind = type(shape).__name__
         raise ValueError(f"{name}.shape is a {kind} of {dimension(shape)}D: use a shape of {dim}D, as the scene.")
-    return map_arrays(lambda leaf, letters, _: _array(leaf), with_topology(shape))
+    shape = map_arrays(lambda leaf, letters, _: _array(leaf), with_topology(shape))
+    return replace(shape, normal=shape.normal / _length(shape.normal)) if isinstance(shape, HalfSpace) else shape
 
 
 def solid_of(shape: Any, dim: int) -> Solid | None:

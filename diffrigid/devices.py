@@ -1,7 +1,7 @@
-"""Work divided over all devices that JAX has, those of other processes too; with one device, as if this were not here.
+"""Work divided over all JAX devices, those of other processes too; with one device this does nothing.
 
-Devices work without a word to each other: unlike where XLA divides a program by itself, each has its own branches, and
-a pass that none of its worlds needs is skipped.
+Devices do not communicate while they work, so each takes its own branches, and a pass that none of its worlds needs is
+skipped, which it would not be if XLA divided the program.
 """
 
 from collections.abc import Callable

@@ -71,13 +71,20 @@ class Force:
         [0.0, 0.5, 0.5]
     """
 
-    body: str = static()
+    body: str = static(kw_only=False)
     F: Leaf = array("D")  # (D, *batch) [N] world axes
     point: Leaf = array("D", default=None)  # (D, *batch) [m] body axes; None: the centre of mass
     control: str | None = static(default=None)
-    constant: ClassVar[bool] = False  # the arm turns with the body
     uniform: ClassVar[bool] = False
-    twists: ClassVar[bool] = True
+
+    @property
+    def constant(self) -> bool:
+        """Unless there is an arm, which turns with the body."""
+        return self.point is None
+
+    @property
+    def twists(self) -> bool:
+        return self.point is not None
 
     def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:
         so, i = rotations(bodies.dim), self.body
@@ -98,7 +105,7 @@ class Torque:
         1.0
     """
 
-    body: str = static()
+    body: str = static(kw_only=False)
     tau: Leaf = array("A")  # (A, *batch) [N m] world axes
     control: str | None = static(default=None)
     constant: ClassVar[bool] = True  # controls are held over a step
@@ -125,8 +132,8 @@ class SpringDamper:
         [0.0, 1.0]
     """
 
-    a: str = static()
-    b: str | None = static(default=None)
+    a: str = static(kw_only=False)
+    b: str | None = static(None, kw_only=False)
     anchor_a: Leaf = array("D")  # (D, *batch) [m]
     anchor_b: Leaf = array("D")  # (D, *batch) [m]
     stiffness: Leaf = array()  # (*batch) [N/m]

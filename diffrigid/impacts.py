@@ -7,10 +7,11 @@ A trajectory stores states, not impulses, so they are inferred, one interval bet
     impulses       the smallest that, at these points and in the joints, explain the changes of momentum and angular
                    momentum beyond what the forces do in the interval (least norm: where points share a load, equally)
 
-What touches a `Profile` is not found.
-Exact for a body with one contact.
+What touches a `Profile` or a `HeightField` is not found, and what it does is taken for that of other contacts of the
+same bodies. Exact for a body with one contact.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +21,7 @@ from jax import Array
 from diffrigid.forces import total_wrench
 from diffrigid.hull import hull_faces
 from diffrigid.pytree import replace
-from diffrigid.shapes import UNEVEN, HalfSpace, edges, radius, vertices
+from diffrigid.shapes import UNEVEN, Box, HalfSpace, Hull, edges, radius, vertices
 from diffrigid.state import Bodies, State, Wrench, momentum, spin
 from diffrigid.step import Trajectory
 from diffrigid.touch import Side, gaps, rotated
@@ -201,8 +202,14 @@ def _side(world: World, group: int) -> Side:
         faces: tuple = ()
     else:
         sides = edges(shapes[0], dim) or ((0, 0),)
-        faces = tuple(hull_faces(corners[0])) if count > 3 else ()
+        faces = (records.faces or ()) if isinstance(records, Hull) else _box_faces() if count > 3 else ()
     return Side(corners, None, rounding, sides, faces, np.linalg.norm(corners, axis=2).max(1) + rounding)
+
+
+@functools.cache
+def _box_faces() -> tuple:
+    """Of any box, one without thickness included."""
+    return tuple(hull_faces(np.array(vertices(Box(half=(1.0, 1.0, 1.0)), 3), float)))
 
 
 def _flown(motion: Motion, k: np.ndarray, body: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -296,6 +303,6 @@ def _anchors(world: World, motion: Motion, k: int, group: Any) -> tuple[np.ndarr
     """Bodies (2, J) of the joints of one kind, and arms (2, J, D) [m] from their centres to the anchors."""
     a, anchor = np.array(group.a), np.asarray(group.anchor_a, float)
     arm_a = rotated(motion.q[k, a], anchor)
-    b = np.array([len(world.names) + len(world.static_names) if end is None else end for end in group.b])
+    b = np.array(group.b)
     x = np.concatenate([motion.x[k], np.zeros((1, world.dim))])
     return np.stack([a, b]), np.stack([arm_a, motion.x[k, a] + arm_a - x[b]])

@@ -10,7 +10,7 @@ import numpy as np
 
 from diffrigid.constraints import joint_rates, placed
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
-from diffrigid.joints import JOINTS, Distance, Pose, separation
+from diffrigid.joints import JOINTS, Distance, Pose, Revolute, separation
 from diffrigid.linkage import ends_of, to_sides
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
@@ -111,6 +111,10 @@ def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:
     lower, upper = number.get("lower", -np.inf), number.get("upper", np.inf)
     if not lower < upper:
         raise ValueError(f"{name}.lower is {lower:g} and upper {upper:g}: expected lower < upper; swap them.")
+    if isinstance(joint, Revolute) and 2.0 * np.pi <= upper - lower < np.inf:
+        raise ValueError(
+            f"{name} has limits from {lower:g} to {upper:g} rad: expected less than a turn; leave them out, or one."
+        )
     for field in ("friction", "damping"):
         if number.get(field, 0.0) < 0:
             raise ValueError(f"{name}.{field} is {number[field]:g}: expected 0 or above; 0 turns it off.")

@@ -5,12 +5,13 @@ A joint is called as `joint(so, a, b)` with the poses (x, q) of its two bodies a
 
 One with a `coordinate`, its angle or its way, may have limits, friction, a motor and damping along it:
 
-    lower, upper    the coordinate stays between; it rebounds there with `restitution`
+    lower, upper    the coordinate stays between; it rebounds there with `restitution`. Orientations do not tell how
+                    often a hinge has turned round: its angle is counted within half a turn of the middle of its limits,
+                    and with one limit from an eighth of a turn beyond it
     friction        the most that resists a rate other than `speed`: dry friction, or a motor if there is a speed
     damping         times the rate: viscous friction
 """
 
-import dataclasses
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.numerics import dot, norm
-from diffrigid.pytree import Leaf, array, pytree
+from diffrigid.pytree import Leaf, array, pytree, static
 from diffrigid.so2 import perp
 from diffrigid.so3 import tangents
 
@@ -28,11 +29,6 @@ class Pose(NamedTuple):
 
     x: Array  # (D, *batch) [m] centre of mass
     q: Array  # (Q, *batch)
-
-
-def _name(default: Any = dataclasses.MISSING) -> Any:
-    """Field for the name of a body; in a World, the colliders of all joints of a group."""
-    return dataclasses.field(default=default, metadata={"static": True}, kw_only=False)
 
 
 @pytree
@@ -50,8 +46,8 @@ class Revolute:
         [[0.0, 0.0]]
     """
 
-    a: Any = _name()
-    b: Any = _name(None)
+    a: Any = static(kw_only=False)  # name of a body; in a World, the colliders of all joints of a group
+    b: Any = static(None, kw_only=False)
     anchor_a: Leaf = array("D")  # (D, *batch) [m]
     anchor_b: Leaf = array("D", default=None)  # (D, *batch) [m]
     axis_a: Leaf = array("D", default=None)  # (3, *batch) [-] 3D
@@ -72,10 +68,20 @@ class Revolute:
         return jnp.concatenate([apart, jnp.stack([dot(so.rotate(b.q, t), along) for t in tangents(self.axis_b)])])
 
     def coordinate(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        """Angle of a against b about the axis, (*batch) [rad] in (-pi, pi]."""
-        turned = so.difference(b.q, a.q)
-        angle = so.log(turned if self.zero is None else so.difference(self.zero, turned))
-        return angle[0] if so.D == 2 else dot(self.axis_a, angle)
+        """Angle of a against b about the axis, (*batch) [rad], within pi of `middle`."""
+        turned, middle = so.difference(b.q, a.q), self.middle()
+        about = middle[None] if so.D == 2 else middle[None] * self.axis_a
+        zero = so.exp(about) if self.zero is None else so.turn_in_body(self.zero, about)
+        angle = so.log(so.difference(zero, turned))
+        return middle + (angle[0] if so.D == 2 else dot(self.axis_a, angle))
+
+    def middle(self) -> Array:
+        """Angle half a turn from that at which angles jump, (*batch) [rad]."""
+        if self.lower is not None and self.upper is not None:
+            return 0.5 * (jnp.asarray(self.lower) + jnp.asarray(self.upper))
+        if self.lower is not None:
+            return jnp.asarray(self.lower) + 0.75 * jnp.pi
+        return jnp.zeros(()) if self.upper is None else jnp.asarray(self.upper) - 0.75 * jnp.pi
 
 
 @pytree
@@ -89,8 +95,8 @@ class Ball:
         (('ball',),)
     """
 
-    a: Any = _name()
-    b: Any = _name(None)
+    a: Any = static(kw_only=False)  # name of a body; in a World, the colliders of all joints of a group
+    b: Any = static(None, kw_only=False)
     anchor_a: Leaf = array("D")  # (D, *batch) [m]
     anchor_b: Leaf = array("D", default=None)  # (D, *batch) [m]
 
@@ -109,8 +115,8 @@ class Weld:
         [[0.3, 0.0]]
     """
 
-    a: Any = _name()
-    b: Any = _name(None)
+    a: Any = static(kw_only=False)  # name of a body; in a World, the colliders of all joints of a group
+    b: Any = static(None, kw_only=False)
     anchor_a: Leaf = array("D", default=0.0)  # (D, *batch) [m]
     anchor_b: Leaf = array("D", default=None)  # (D, *batch) [m]
     q: Leaf = array("Q", default=None)  # (Q, *batch) orientation of a in the axes of b
@@ -130,8 +136,8 @@ class Prismatic:
         ([[0.0, 0.0]], [[1.0, 0.0]])
     """
 
-    a: Any = _name()
-    b: Any = _name(None)
+    a: Any = static(kw_only=False)  # name of a body; in a World, the colliders of all joints of a group
+    b: Any = static(None, kw_only=False)
     anchor_a: Leaf = array("D", default=0.0)  # (D, *batch) [m]
     anchor_b: Leaf = array("D", default=None)  # (D, *batch) [m]
     axis_b: Leaf = array("D")  # (D, *batch) [-] axes of b; of the world where b is None
@@ -165,8 +171,8 @@ class Distance:
         [2.0]
     """
 
-    a: Any = _name()
-    b: Any = _name(None)
+    a: Any = static(kw_only=False)  # name of a body; in a World, the colliders of all joints of a group
+    b: Any = static(None, kw_only=False)
     anchor_a: Leaf = array("D", default=0.0)  # (D, *batch) [m]
     anchor_b: Leaf = array("D")  # (D, *batch) [m]
     length: Leaf = array(default=None)  # (*batch) [m]; None: as at the start

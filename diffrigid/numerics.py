@@ -1,12 +1,12 @@
-"""Gradient-safe arithmetic. Each function says which NaN it prevents.
+"""Gradient-safe arithmetic, and arithmetic that XLA makes fast programs of on a CPU.
 
-The pattern is the two-sided `where`: the argument is made harmless *before* the singular operation, because
-reverse mode multiplies the derivative of the branch not taken by zero, and 0 * inf is NaN.
+The pattern for gradients is the two-sided `where`: the argument is made harmless *before* the singular operation,
+because reverse mode multiplies the derivative of the branch not taken by zero, and 0 * inf is NaN.
 
 Vectors carry their components on the leading axis, `(D, *batch)`.
 
-What is called in many places is jitted, here and elsewhere, so that it is traced, differentiated and transposed once
-for all of them; XLA writes it out. A gradient is traced in three quarters of the time.
+Functions called in many places are jitted, here and elsewhere, so that JAX traces, differentiates and transposes them
+once; XLA inlines them. Tracing a gradient takes a quarter less time.
 """
 
 import functools
@@ -55,7 +55,7 @@ def unit_vector(like: Array, axis: int) -> Array:
 def components(*parts: Array) -> Array:
     """Numbers (*batch) as the components of a vector, (D, *batch).
 
-    By choice and not by `jnp.stack`: XLA on a CPU does not vectorise a loop that concatenates, and a cross product
+    By `lax.select` and not `jnp.stack`: on a CPU XLA does not vectorise loops that concatenate, and a cross product
     took ten times as long.
     """
     alike = parts if all(part.shape == parts[0].shape for part in parts) else jnp.broadcast_arrays(*parts)
@@ -166,7 +166,7 @@ def _some_of_all(size: int, batched: list[bool], flags: Array) -> tuple[Array, b
 
 
 def opaque_true(like: Array) -> Array:
-    """True, which the compiler does not know, for `apart`; `like` is any number of the program, infinity excepted."""
+    """True, in a form that the compiler cannot know; see `apart`. `like`: any array of the program, not infinite."""
     return some(~(jnp.ravel(like)[:1] > jnp.inf))
 
 
@@ -273,7 +273,7 @@ def normalise(a: Array, fallback: Array | None = None) -> Array:
 def solve_regular(matrix: Array, right: Array) -> Array:
     """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), no derivative.
 
-    Zeros where a matrix is singular.
+    Finite where a matrix is singular, but no solution.
     """
     matrix, right = lax.stop_gradient((matrix, right))
     if len(matrix) <= TINY and right.shape[1] == 1:

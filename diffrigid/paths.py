@@ -1,17 +1,19 @@
 """Names of parameters: a path such as "ball.mass" and the leaf, or the part of one, that it stands for.
 
-restitution, friction, ..., gravity      a coefficient of all bodies and statics; the gravity vector
+restitution, friction, ..., gravity      a coefficient of all bodies and statics, their own too; the gravity vector
 contact.width, contact.rest_speed        numbers of the contact model
 FORCE.field                              a force of the scene, by its name: "drag.linear"
 JOINT.field                              a joint of the scene, by its name: "revolute.anchor_a"
 BODY.mass | inertia | restitution | friction | ... | shape.FIELD
 BODY.x | v | q | w | angle               initial state (angle: 2D)
 STATIC.x | q | angle | restitution | friction | ... | shape.FIELD
+PATH[k]                                  number k of a vector: "ball.v[0]"
 
 The dots stand for the coefficients that only some worlds have: restitution_falloff, rolling_friction,
 spinning_friction.
 """
 
+import re
 from typing import Any, NamedTuple
 
 import jax
@@ -33,11 +35,11 @@ UNITS = {
     "x": "m", "v": "m/s", "angle": "rad", "w": "rad/s",
     "radius": "m", "half": "m", "half_length": "m", "vertices": "m", "points": "m", "offset": "m", "width": "m",
     "heights": "m", "spacing": "m",
-    "linear": "N s/m", "angular": "N m s", "stiffness": "N/m", "damping": "N s/m", "length": "m",
+    "linear": "N s/m", "angular": "N m s/rad", "stiffness": "N/m", "damping": "N s/m", "length": "m",
     "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
     "restitution_falloff": "s/m", "rolling_friction": "m", "spinning_friction": "m",
 }  # fmt: skip
-ABOUT = {"lower": "rad", "upper": "rad", "speed": "rad/s", "friction": "N m", "damping": "N m s"}  # an axis
+ABOUT = {"lower": "rad", "upper": "rad", "speed": "rad/s", "friction": "N m", "damping": "N m s/rad"}  # an axis
 ALONG = {"lower": "m", "upper": "m", "speed": "m/s", "friction": "N", "damping": "N s/m"}
 
 
@@ -56,6 +58,9 @@ def read(world: World, state: State, path: str) -> Array:
         >>> dr.paths.read(world, state, "ball.x").tolist()
         [0.0, 1.0]
     """
+    whole, index = component(path)
+    if index is not None:
+        return _item(read(world, state, whole), whole, index)
     place = places(world, path)[0]
     leaf: Any = (world, state)
     for key in place.chain:
@@ -78,6 +83,11 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
         >>> dr.rollout(*thrown, dt=1 / 60, steps=30).state.x[-1, 0].round(2).tolist()
         [0.0, 0.77]
     """
+    whole, index = component(path)
+    if index is not None:
+        vector = read(world, state, whole)
+        part = numbers(path, value, _item(vector, whole, index).shape, finite=False)
+        return write(world, state, whole, _with_rows(vector, index, part.astype(vector.dtype)))
     pair: Any = (world, state)
     for place in places(world, path):
         pair = _update(pair, place.chain, lambda record, field, place=place: _set(record, field, place, path, value))
@@ -86,26 +96,44 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
 
 def unit(world: World, path: str) -> str:
     """SI unit of a parameter; "" where it has none or is unknown."""
-    owner, _, field = path.rpartition(".")
+    owner, _, field = component(path)[0].rpartition(".")
     kinds = [joint for names, joint in zip(world.joint_names, world.joints, strict=True) if owner in names]
     along = {} if not kinds else ABOUT if isinstance(kinds[0], Revolute) else ALONG
     return along.get(field, UNITS.get(field, ""))
 
 
 def places(world: World, path: str) -> list[Place]:
-    """The leaves that a path names.
+    """The leaves that a path names, or a component of them.
 
     Raises:
         ValueError: there is no such parameter; the message lists the nearest.
     """
-    catalogue = _catalogue(world)
-    if path not in catalogue:
-        raise ValueError(f"no parameter {path!r} in this world: {nearest(path, catalogue)}")
-    return catalogue[path]
+    known, whole = catalogue(world), component(path)[0]
+    if whole not in known:
+        raise ValueError(f"no parameter {path!r} in this world: {nearest(whole, known)}")
+    return known[whole]
 
 
-def _catalogue(world: World) -> dict[str, list[Place]]:
-    """Every path of a world."""
+def component(path: str) -> tuple[str, int | None]:
+    """Path of the whole and index: "ball.v[0]" is ("ball.v", 0), "ball.v" is ("ball.v", None)."""
+    match = re.fullmatch(r"(.+)\[(\d+)\]", path)
+    return (match[1], int(match[2])) if match else (path, None)
+
+
+def _item(vector: Array, path: str, index: int) -> Array:
+    """A number of a vector, by the path of the whole."""
+    if not vector.ndim or index >= vector.shape[0]:
+        raise ValueError(f"{path}[{index}] is no number: {path} has the shape {vector.shape}.")
+    return _row(vector, index)
+
+
+def catalogue(world: World) -> dict[str, list[Place]]:
+    """Every path of a world, and what it stands for.
+
+    Example:
+        >>> [path for path in dr.paths.catalogue(world) if path.startswith("ball.") and "shape" in path]
+        ['ball.shape.radius']
+    """
     out: dict[str, list[Place]] = {}
     coefficients = tuple(name for name in COEFFICIENTS if getattr(world.bodies, name) is not None)
     for name in coefficients:

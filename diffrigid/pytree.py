@@ -26,9 +26,9 @@ def array(*letters: Any, default: Any = dataclasses.MISSING) -> Any:
     return dataclasses.field(default=default, metadata={"letters": letters}, kw_only=True)
 
 
-def static(default: Any = dataclasses.MISSING) -> Any:
+def static(default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:
     """Field for compiled-in data: integers, strings, tuples of them. Must hash and compare."""
-    return dataclasses.field(default=default, metadata={"static": True}, kw_only=True)
+    return dataclasses.field(default=default, metadata={"static": True}, kw_only=kw_only)
 
 
 def stacked(letter: str) -> Any:
@@ -40,8 +40,8 @@ def stacked(letter: str) -> Any:
 def pytree(cls):
     """Make `cls` a frozen, keyword-only dataclass and register it with JAX.
 
-    The name of the class is compiled in as a field of its own: JAX compares two records of different classes as equal
-    if only their fields are, and `jit` then now and then takes what it compiled for the other.
+    The name of the class is a static field: JAX treats records of different classes with equal fields as equal, and
+    `jit` may then run the program compiled for the other.
     """
     cls.__annotations__ = {**cls.__annotations__, "_class": str}
     cls._class = dataclasses.field(default=cls.__qualname__, repr=False, kw_only=True, metadata={"static": True})

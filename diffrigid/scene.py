@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import jax
@@ -63,6 +63,7 @@ class Body:
     """
 
     shape: Shape | None
+    _: KW_ONLY
     mass: Any = None
     density: Any = None
     inertia: Any = None
@@ -90,6 +91,7 @@ class Static:
     """
 
     shape: Shape
+    _: KW_ONLY
     x: Any = None
     angle: Any = None
     q: Any = None

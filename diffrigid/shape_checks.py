@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from diffrigid.convert import largest, numbers
+from diffrigid.convert import TYPED, largest, numbers
 from diffrigid.hull import FLAT, extent, faces_problem, first, hull_problem, triples
 from diffrigid.pytree import map_arrays, refuse_missing
 from diffrigid.shapes import (
@@ -23,8 +23,6 @@ from diffrigid.shapes import (
     floats,
     traced,
 )
-
-ROUNDING = 8  # machine epsilons by which a unit vector may miss length one
 
 
 def check_shape(shape: Shape, where: str) -> None:
@@ -106,7 +104,7 @@ def _half_problem(value):
 
 def _normal_problem(value):
     length = math.sqrt(np.square(value, dtype=float).sum())
-    if abs(length - 1) > ROUNDING * np.finfo(value.dtype).eps:
+    if abs(length - 1) > TYPED:
         return f"has length {length:.9g}: expected a unit vector; divide it (and the offset) by its length."
 
 

@@ -87,8 +87,8 @@ def rollout(
             no longer than dt. Differentiable. Inside jit or vmap, give `substeps`, the number of steps of each
             interval, because it has to be known when tracing.
         controls: values (T, D or A, *batch) that forces with a `control` add, by its name; held over each interval.
-        memory: [bytes] of states that reverse mode may save. If those of all steps do not fit, it saves one after every
-            square root of their number, which is the least that it can do with, and computes each step once more.
+        memory: [bytes] that reverse mode may use for saved states. If the states of all T steps do not fit, only about
+            sqrt(T) are kept, and the steps between them are computed again.
 
     Raises:
         ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing; memory < 1;
@@ -112,12 +112,10 @@ def rollout(
         controls = as_controls(world.forces, controls, state.x.dtype, (count,), state.x.shape[2:])
         states = _rollout_jit(world, state, jnp.broadcast_to(longest, (count,)), controls, (1,) * count, memory)
         return Trajectory(t=t, state=states, world=world, controls=controls)
-    t = jnp.asarray(numbers("times", times, None), state.x.dtype)
-    if t.ndim != 1 or t.shape[0] < 2:
-        raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
-    controls = as_controls(world.forces, controls, state.x.dtype, (len(t) - 1,), state.x.shape[2:])
-    counts = _substeps(t, longest) if substeps is None else _given_substeps(substeps, t.shape[0] - 1)
-    states = _rollout_jit(world, state, jnp.diff(t), controls, counts, memory)
+    t, intervals = _intervals(times, state.x.dtype)
+    controls = as_controls(world.forces, controls, state.x.dtype, (len(intervals),), state.x.shape[2:])
+    counts = _substeps(intervals, longest) if substeps is None else _given_substeps(substeps, len(intervals))
+    states = _rollout_jit(world, state, intervals, controls, counts, memory)
     return Trajectory(t=t, state=states, world=world, controls=controls)
 
 
@@ -167,7 +165,7 @@ def step_length(dt: Any, state: State, batch: bool = False) -> Numbers:
 
 
 def at_least_one(name: str, count: Any) -> int:
-    """A number of steps, of worlds, or of bytes."""
+    """`count`, checked: a number of steps, of worlds, or of bytes."""
     if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
         raise ValueError(f"{name} is {count!r}, expected an integer >= 1")
     return int(count)
@@ -186,15 +184,23 @@ def _given_substeps(substeps: Any, intervals: int) -> tuple[int, ...]:
     return counts
 
 
-def _substeps(t: Array, longest: Array) -> tuple[int, ...]:
-    """Steps of each interval, from concrete times (those of `jax.grad` are)."""
+def _intervals(times: Any, dtype: Any) -> tuple[Any, Array]:
+    """Times (T+1,) [s], and those between: in double precision where known, for a clock that began long ago."""
+    t = numbers("times", times, None)
+    if t.ndim != 1 or t.shape[0] < 2:
+        raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
+    between = jnp.diff(t) if traced(t) else np.diff(np.asarray(times, float))
+    return t if traced(t) else np.asarray(times, float), jnp.asarray(between, dtype)
+
+
+def _substeps(intervals: Array, longest: Array) -> tuple[int, ...]:
+    """Steps of each interval, where they are concrete (those of `jax.grad` are)."""
     try:
-        t_known, dt_known = np.asarray(lax.stop_gradient(t)), np.asarray(lax.stop_gradient(longest))
+        gaps, dt_known = np.asarray(lax.stop_gradient(intervals)), np.asarray(lax.stop_gradient(longest))
     except jax.errors.TracerArrayConversionError:
         raise ValueError(
             "times or dt is traced by jit or vmap: give rollout the number of steps, substeps=(...)"
         ) from None
-    gaps = np.diff(t_known)
     if not (gaps > 0).all():
         raise ValueError(f"times must increase, got steps of {gaps.min():g} s or NaN: sort them and drop repeats")
     return tuple(int(n) for n in np.maximum(np.ceil(gaps / dt_known - 1e-6), 1))

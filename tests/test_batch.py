@@ -84,3 +84,14 @@ def test_bad_batches(many):
         dr.rollout_batch(world, states, dt=0.0, steps=3)
     with pytest.raises(ValueError, match="steps is 0, expected an integer >= 1"):
         dr.rollout_batch(world, states, dt=1 / 60, steps=0)
+
+
+def test_controls_of_a_batch_are_those_of_each_world():
+    puck = dr.Body(None, mass=1.0, inertia=1.0, x=(0.0, 0.0))
+    world, state = dr.scene({"puck": puck}, forces=[dr.Force("puck", F=(0.0, 0.0), control="push")])
+    states = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], 2, axis=0), state)
+    push = [[[1.0, 0.0]] * 3, [[0.0, 2.0]] * 3]  # (B, T, D)
+    run = dr.rollout_batch(world, states, dt=1.0, steps=3, controls={"push": push})
+    assert_allclose(run.v[:, -1, 0], [[3.0, 0.0], [0.0, 6.0]], atol=1e-12)
+    with pytest.raises(ValueError, match=r"shape \(3, 2, 2\): expected \(3, 2\) or \(2, 3, 2\)"):
+        dr.rollout_batch(world, states, dt=1.0, steps=3, controls={"push": np.zeros((3, 2, 2))})

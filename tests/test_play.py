@@ -80,7 +80,7 @@ def test_few_frames_keep_the_ends_and_uneven_times():
     assert content(dr.play(bounce()))["runs"][0]["t"] == [0.0, 0.9, 54]
 
 
-def test_measured_columns_are_kept_with_what_is_missing():
+def test_measured_columns_are_kept_with_what_is_missing(tmp_path):
     run = bounce()
     t = T[::3] + 1e-3
     x = np.where(np.arange(len(t))[:, None] == 4, np.nan, np.stack([t, 2 * t], axis=1))
@@ -92,6 +92,12 @@ def test_measured_columns_are_kept_with_what_is_missing():
     assert seen["bodies"] == [1]
     np.testing.assert_allclose(table[:, :3], np.column_stack([x, t]), atol=error.max())
     assert np.isnan(table[:, 3:]).all() and np.isnan(table[4, :2]).all()
+    path = tmp_path / "drop.csv"
+    path.write_text("t,ball.angle\n" + "\n".join(f"{a},{b}" for a, b in zip(t, 3 * t, strict=True)))
+    for file in (path, str(path)):
+        np.testing.assert_allclose(
+            unpacked(content(dr.play(run, file))["runs"][0]["measured"]["poses"])[0][:, 2], 3 * t, atol=1e-4
+        )
     by_run = content(dr.play({"a": run, "b": run}, {"b": {"t": t, "ball.angle": 3 * t + turns}}))["runs"]
     assert by_run[0]["measured"] is None and by_run[1]["measured"]["bodies"] == [0]
     np.testing.assert_allclose(unpacked(by_run[1]["measured"]["poses"])[0][:, 2], 3 * t, atol=1e-4)
@@ -163,6 +169,15 @@ def test_energy_counts_springs():
     world, state = dr.scene(bodies, forces=[spring])
     one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
     np.testing.assert_allclose(energies(world, one), [[0.0, 0.5 * 8 * 0.4**2, 0.5 * 8 * 0.4**2]], rtol=1e-9)
+
+
+def test_a_plate_without_thickness_is_drawn_with_its_impacts():
+    plate = dr.Body(dr.Box(half=(0.5, 0.3, 0.0)), mass=1.0, x=(0.0, 0.0, 0.6), q=(0.8, 0.0, 0.6, 0.0))
+    floor = dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))
+    world, state = dr.scene({"plate": plate, "floor": floor}, gravity=(0.0, 0.0, -G), restitution=0.5)
+    run = dr.rollout(world, state, dt=1 / 60, steps=20)
+    table = contacts(run, run.t)
+    assert (table[:, 1] == 1).any() and content(dr.play(run))["runs"][0]["contacts"] is not None
 
 
 # ---- what is refused

@@ -144,6 +144,13 @@ RUNS = {
 }  # fmt: skip
 
 
+def test_times_of_a_clock_are_not_rounded_before_they_are_subtracted():
+    world, state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), one_ball())
+    t = np.arange(31) / 60
+    late = dr.rollout(world, state, dt=1 / 60, times=1.7e9 + t)
+    assert_allclose(late.state.x, dr.rollout(world, state, dt=1 / 60, times=t).state.x, atol=1e-5)
+
+
 @pytest.mark.parametrize("mistake", RUNS)
 def test_mistakes_in_a_run_are_named(mistake):
     message, run = RUNS[mistake]

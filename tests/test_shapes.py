@@ -237,7 +237,7 @@ BAD = [  # shape, pattern of the message
     (Hull(vertices=CUBE, faces=tuple(f[::-1] for f in FACES)), r"faces are inside out"),
     (Hull(vertices=CUBE, faces=hull_faces(TETRAHEDRON)), r"faces enclose .* of 8 in the hull"),
     (HalfSpace(normal=(0.0, 2.0)), r"ball.shape.normal has length 2: .* divide it .* by its length"),
-    (HalfSpace(normal=np.array([0.6, 0.80001], np.float32)), r"normal has length 1.00000"),
+    (HalfSpace(normal=np.array([0.6, 0.801], np.float32)), r"normal has length 1.0008"),
 ]
 
 

@@ -179,6 +179,7 @@ def test_a_batch_in_single_precision():
     [
         ({"lower": 1.0, "upper": -1.0}, "lower is 1 and upper -1: expected lower < upper"),
         ({"lower": 0.5}, "starts at 0, outside its limits 0.5"),
+        ({"lower": -4.0, "upper": 4.0}, "expected less than a turn"),
         ({"friction": -0.1}, "friction is -0.1: expected 0 or above"),
         ({"damping": -0.1}, "damping is -0.1: expected 0 or above"),
         ({"upper": 1.0, "restitution": 1.5}, "restitution is 1.5"),
@@ -189,6 +190,19 @@ def test_a_batch_in_single_precision():
 def test_mistakes_are_named(along, message):
     with pytest.raises(ValueError, match=message):
         wheel(1.0, **along)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_limits_may_lie_beyond_half_a_turn(dim):
+    """Where the angle of an orientation jumps nothing happens, and what has one limit turns a long way from it."""
+
+    def end(upper, speed, only):
+        limits = {"upper": upper} if only else {"lower": -0.5, "upper": upper}
+        return turned(wheel(speed, dim, restitution=0.6, **limits), 1.0)[0]
+
+    bounced = end(4.0, 4.5, False)
+    assert_allclose(bounced if dim == 2 else 2 * np.pi - bounced, 4.0 - 0.6 * 0.5, atol=EXACT)
+    assert_allclose(jnp.abs(end(0.5, -4.5, True)), 4.5 if dim == 2 else 2 * np.pi - 4.5, atol=EXACT)
 
 
 def test_friction_turns_back_with_the_motion():

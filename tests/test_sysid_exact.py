@@ -156,6 +156,44 @@ def test_interrupting_returns_the_best_so_far(records, monkeypatch):
     assert np.isfinite(found.costs).all()
 
 
+def test_a_fit_that_has_not_converged_says_so(records):
+    found = dr.fit(*point(), records, free=FREE, progress=False, iterations=1)
+    assert found.notes[0].startswith("not converged after 1 iterations")
+    few = dr.fit(*point(), records, free=FREE, progress=False, solver=sysid.lbfgs(), iterations=1)
+    assert few.notes[0].startswith("not converged after 1 iterations")
+
+
+def test_noise_that_is_given_does_not_change_a_score(fit, records):
+    """A score is in the unit of its column, whoever knows the noise."""
+    rows = len(records[0].observations["t"])
+    known = [dr.Record(records[0].observations, state=records[0].state, noise={"p.x": np.linspace(0.5, 2.0, rows)})]
+    alike = [dr.Record(records[0].observations, state=records[0].state, noise={"p.x": 3.0})]
+    free = {key: kind for key, kind in FREE.items() if key == "gravity"}
+    held = dr.fit(*point(), records[:1], free=free, progress=False)
+    assert_allclose([held.score(other)["p.x"] for other in (known, alike)], held.score(records[:1])["p.x"], rtol=1e-12)
+
+
+def test_a_fit_moves_as_it_was_fitted():
+    """With the smooth impacts of its world, or of its last width: a near miss at a width of 0.1 m."""
+    disc = dr.Disc(radius=0.2)
+    scene = {"cue": dr.Body(disc, mass=1.0, x=(0.0, 0.0), v=(2.0, 0.0)), "ball": dr.Body(disc, mass=1.0, x=(1.0, 0.45))}
+    world, state = dr.scene(scene, restitution=0.8)
+    smooth = dr.replace(world, contact=dr.Contact(width=0.1))
+    t = np.arange(31) / 30
+    moved = np.asarray(dr.rollout(smooth, state, dt=1 / 30, times=t).state.x[:, 1])
+    assert moved[-1, 1] > 0.5  # exactly they do not meet
+    free = {"cue.v": dr.real()}
+    for fitted in (
+        dr.fit(smooth, state, {"t": t, "ball.x": moved}, free=free, progress=False),
+        dr.fit(world, state, {"t": t, "ball.x": moved}, free=free, widths=(0.3, 0.1), progress=False),
+    ):
+        assert_allclose(fitted["cue.v"].value, (2.0, 0.0), atol=1e-6)
+        assert_allclose(fitted.trajectory.state.x[:, 1], moved, atol=1e-6)
+        assert fitted.score({"t": t, "ball.x": moved})["ball.x"] < 1e-6
+    with pytest.raises(ValueError, match="expected the same in all of them"):
+        dr.fit(world, state, [dr.Record({"t": t, "ball.x": moved}, world=w) for w in (world, smooth)], free=free)
+
+
 def test_score_and_prediction_of_held_out_records(fit):
     held = many(seed=9)[:2]
     scores = fit.score([dr.Record(r.observations, state=r.state) for r in held])

@@ -206,6 +206,13 @@ def test_bad_input_of_a_fit(data, arguments, message):
         ({"cue.x": dr.direction(), "cue.mass": dr.direction()}, "expected a vector"),
         ({("cue.mass",): dr.shares()}, "two or more"),
         ({"cue.x": dr.each(3)}, "expected interval"),
+        ({"cue.mass": dr.positive(), "restitution": dr.real(), "cue.restitution": dr.real()}, "set the same number"),
+        ({"cue.q": dr.rotation(), "cue.angle": dr.real()}, "set the same number"),
+        ({"cue.v[0]": dr.real(), "cue.v": dr.real()}, "set the same number"),
+        ({"cue.v[2]": dr.real()}, r"cue.v\[2\] is no number"),
+        ({"contact.width": dr.positive()}, "the widths to go through"),
+        ({"ball.v": dr.direction()}, "a direction that is not zero"),
+        ({"cue.mass": dr.interval(2, 3)}, "starts at 1.0, expected from 2 to 3"),
     ],
 )
 def test_bad_parameters_of_a_fit(free, message):
@@ -213,6 +220,24 @@ def test_bad_parameters_of_a_fit(free, message):
         dr.fit(WORLD, STATE, GOOD, free=free, progress=False)
     with pytest.raises(ValueError, match="deviation"):
         dr.prior(dr.real(), 0.0, 0.0)
+
+
+def test_a_component_of_a_vector_is_free_alone():
+    found = dr.fit(WORLD, STATE, GOOD, free={"cue.v[1]": dr.real()}, progress=False)
+    assert found["cue.v[1]"].unit == "m/s" and found.state.v[0, 0] == STATE.v[0, 0]
+
+
+def test_a_column_that_is_called_as_a_parameter_is_refused():
+    seen = {"die": dr.Pinhole(dr.Marker("die"), x=(0.0, 0.0, 0.0), q=(1.0, 0.0, 0.0, 0.0), focal=100.0)}
+    with pytest.raises(ValueError, match="give the column another name"):
+        dr.fit(
+            SOLID,
+            SOLID_STATE,
+            {"t": T, "die": np.ones((6, 2))},
+            observe=seen,
+            free={"die.x": dr.real()},
+            progress=False,
+        )
 
 
 def test_pieces_of_a_long_record_start_where_it_was_measured():

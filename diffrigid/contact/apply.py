@@ -1,8 +1,8 @@
 """From the contacts of a pass to the bodies after it: what acts, how it moves them, and where they are anchored anew.
 
-A resting contact force is taken as constant since the last impact of the body, a time T before: it
-gives P, so v += P / m and x += (T / 2) P / m, its centroid being in the middle, where it has the arms that the contact
-had then. For a block that slides on a floor under Coulomb friction this is exact; for what tips over, second order.
+A resting contact force is constant over the time T since the last impact of the body. Its impulse P changes v by P / m
+and x by (T / 2) P / m: its centroid is in the middle of that time, and so are its lever arms (`levers.py`). For a block
+that slides on a floor with Coulomb friction this is exact; for one that tips over, of second order.
 """
 
 from typing import Any

@@ -1,10 +1,10 @@
 """Very many discs or spheres: a step whose cost grows as their number, with neighbours from a grid.
 
-Every body is a world of its own here, on the last axis with the batch, which vectorises: arrays are (..., M) for the M
-bodies of all worlds. In rounds, each body looks for its next impact, without derivative. Two that are next for each
-other meet, as do a body and a static; the impacts of a round are gathered, evaluated and put back. What is next for
-only one of two waits for a later round, so that all happen in their order, and those at the same time one after the
-other. An impact that the rounds leave over is found late by the next step, as elsewhere, and repaired.
+The bodies of all worlds lie side by side on the last axis, which vectorises: arrays are (..., M) for M bodies. In each
+round every body finds its next impact, without derivatives. Pairs that are each other's next impact collide now, as do
+bodies that meet a static: their impacts are gathered, evaluated and put back. An impact that is next for only one of
+the two waits for a later round, so that all happen in order. One that the rounds leave over is found, and repaired, by
+the next step.
 
 Nothing here holds what rests, so that there are no forces.
 """

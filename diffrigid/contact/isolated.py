@@ -18,7 +18,7 @@ from jax import Array, lax
 from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
-from diffrigid.contact.impulse import restitution_at
+from diffrigid.contact.impulse import comes_to_rest, restitution_at
 from diffrigid.contact.sides import Side
 from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, sum_of_terms, summed
 from diffrigid.contact.strikes import is_rolling, materials, mixed, relative_path_is_straight
@@ -220,20 +220,20 @@ def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> A
         n = jax.vmap(so.rotate)(b.q, b.shape.normal)
         each = jax.vmap(jax.vmap(mixed, (None, 0)), (0, None))
         e, *falloff = map(each, own, others)
-        return n, jax.vmap(dot)(n, b.x) + b.shape.offset, (2.0 * e, *falloff)
+        return n, jax.vmap(dot)(n, b.x) + b.shape.offset, (e, *falloff)
 
-    def one(body: tuple, plane: tuple, twice_e: tuple) -> Array:
+    def one(body: tuple, plane: tuple, law: tuple) -> Array:
         (x, v, acc, t0, since, radius), (n, offset) = body, plane
         acc = None if straight else dot(n, acc)
         s, _, found, u, sunk = meet_on_parabola(dot(n, x) - offset - radius, dot(n, v), acc, None)
         s = jnp.where(sunk | (t0 + s < since), t0, t0 + s)
-        back = restitution_at(u, *twice_e) * u
-        rests = (u <= world.contact.rest_speed) | (back <= (0.0 if acc is None else -acc * (dt - s)))
+        closing = jnp.zeros_like(u) if acc is None else -acc
+        rests = comes_to_rest(u, restitution_at(u, *law) * u, closing, dt - s, world.contact.rest_speed)
         return jnp.where(found, jnp.where(rests & (s <= dt), RESTS, s), jnp.inf)
 
-    n, offset, twice_e = apart(live, planes, b, own, others)
+    n, offset, law = apart(live, planes, b, own, others)
     bodies = (f.x, f.v, f.a, f.t0, a.since, a.shape.radius)
-    return jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, 0))(bodies, (n, offset), twice_e)
+    return jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, 0))(bodies, (n, offset), law)
 
 
 def _allowed(table: Table, times: Array) -> Array:

@@ -1,11 +1,11 @@
 """Impulses that a pass knows from the one before it, and that the others are solved beside.
 
-Friction that turns back   Where a slip stops within the time that a contact is held for and goes back, friction acts
-                           one way first and then the other. Its sum follows from the impulses of a pass in which it
-                           acts one way: that pass is not applied, and the next one knows it.
-Loads                      What carries a load stays where it is, in both directions: what the load has moved by is
-                           taken back, and found anew with the gaps closed. So a gap closes that has opened beside
-                           another one, where what rests was turned within the step.
+Friction that reverses   Where a slip stops and reverses while the contact is held, friction acts first one way, then
+                         the other. A trial pass, with friction one way, tells the total; the trial is discarded, and
+                         the next pass uses the total.
+Loads                    A loaded contact must not move, in either direction. The displacement by its load is taken
+                         back, and found anew with all gaps closed: so a gap closes that opened beside another contact
+                         when the body turned within the step.
 """
 
 from typing import Any

@@ -1,9 +1,9 @@
 """Where a contact acts on its two bodies: at the end of the time that it is held for, and in the middle of it.
 
-A resting force acts evenly over that time T, so its impulse at the middle. There the bodies and their contact were
-elsewhere, at p - (T/2) p' and x - (T/2) v, and the normal was n - (T/2) n': impulses have the arms and the direction of
-the middle, which keeps angular momentum, and what they have to hold is the velocity at the arms of the end, along the
-normal of the end. With all at the end, what tips over, or slides over a round body, is of first order.
+A resting force acts evenly over that time T, so its impulse acts in the middle, when the contact was at p - (T/2) p',
+the bodies at x - (T/2) v, and the normal was n - (T/2) n'. With the arms and the normal of that moment angular momentum
+is kept. The velocity that it must cancel is that at the end, along the normal of the end. With the geometry of the end
+for both, what tips over, or slides over a round body, would be of first order only.
 """
 
 from typing import Any
@@ -55,7 +55,7 @@ def levers(
     rate = moving.point + 0.5 * sign * moving.gap[None] * normal
     turned = half * (rate - (at_b.v if at_a.v is None else at_a.v - drift))
     size: Any = sum(dot(arm, arm) for arm, at in zip(ends, (at_a, at_b), strict=True) if at.v is not None)
-    # No further than arms are long: what turns faster than steps resolve is not to turn them around.
+    # No further than arms are long: a body that turns faster than steps resolve must not flip them.
     turned = safe_divide(size, size + 4.0 * dot(turned, turned))[None] * turned
     turn = None
     if turns:

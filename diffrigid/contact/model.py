@@ -15,7 +15,7 @@ and repaired.
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from jax import Array, lax
 from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.apply import apply_impulses
 from diffrigid.contact.crowd import step_crowd
-from diffrigid.contact.impulse import restitution_at
+from diffrigid.contact.impulse import comes_to_rest, restitution_at
 from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
 from diffrigid.contact.known import Known
 from diffrigid.contact.resting import Law, Strikes
@@ -57,10 +57,10 @@ class Contact:
     Args:
         width: (*batch) [m] 0 is exact. Positive: smooth collision impulses, for paths that just miss as well. A
             traced number: anneal it to zero without recompiling.
-        rest_speed: (*batch) [m/s] slower impacts do not rebound. Whatever its speed, an impact after which the
-            bodies would meet again before the step ends does not rebound either, but rests.
-        sweeps: how many impacts in a row a body may have within one step. One that comes later is found late and
-            repaired in the next step. Sweeps that are not needed cost nothing.
+        rest_speed: (*batch) [m/s] slower impacts do not rebound. Nor does a faster one after which the bodies would
+            meet again before the step ends: they come to rest on each other.
+        sweeps: largest number of successive impacts of a body within a step. Later ones are found, and repaired, in
+            the next step. A step that does not need its sweeps skips them; in a gradient each costs memory traffic.
         neighbours: for how many others near a body there is room, in a crowd of 256 bodies and more: see
             `missed_pairs`.
 
@@ -103,50 +103,49 @@ class Contact:
 
         # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches.
         @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
-        def one_pass(anchors, resting, known, found, rests, phase):
-            del found, rests
-            return _pass(world, anchors, launch, resting, known, dt, phase)
+        def one_pass(now, phase):
+            return _pass(world, now, launch, dt, phase)
 
         tables = tables_of(world) if is_crowded(world) else ()
 
-        def isolated_or_any(anchors, resting, known, found, rests, phase):
-            flight = lax.stop_gradient(launch(anchors.state, anchors.t0))
-            following, isolated, needed = next_impacts(world, tables, flight, anchors.since, dt)
+        def isolated_or_any(now, phase):
+            flight = lax.stop_gradient(launch(now.anchors.state, now.anchors.t0))
+            following, isolated, needed = next_impacts(world, tables, flight, now.anchors.since, dt)
 
             def isolated_pass():
-                return (
-                    meet_in_rounds(world, tables, following, needed, anchors, launch, dt),
-                    resting,
-                    known,
-                    some(needed > 0),
-                    rests,
-                )
+                after = meet_in_rounds(world, tables, following, needed, now.anchors, launch, dt)
+                return now._replace(anchors=after, found=some(needed > 0))
 
-            def any_pass():
-                return one_pass(anchors, resting, known, found, rests, phase)
+            return lax.cond(isolated & (phase == IMPACT), isolated_pass, lambda: one_pass(now, phase))
 
-            return lax.cond(isolated & (phase == IMPACT), isolated_pass, any_pass)
-
-        def maybe(carry, phase):
-            *_, known, found, rests = carry
-            needed = jnp.where(phase == IMPACT, found, rests)
-            if known is not None:
-                needed = jnp.where(phase == TURN, some(known.turns()), needed)
+        def maybe(now, phase):
+            needed = jnp.where(phase == IMPACT, now.found, now.rests)
+            if now.known is not None:
+                needed = jnp.where(phase == TURN, some(now.known.turns()), needed)
             some_pass = isolated_or_any if tables else one_pass
-            return lax.cond(needed, lambda c: some_pass(*c, phase), lambda c: c, carry), None
+            return lax.cond(needed, lambda now: some_pass(now, phase), lambda now: now, now), None
 
         impacts = self.sweeps + HOLDS * waits(world)
         loaded, rows = is_loaded(world), len(always) + is_rolling(world) * contact_count(world)
         phases = jnp.array([IMPACT] * impacts + [HOLD] + [TURN] * loaded + [PUSH])
         nothing = jnp.zeros((rows, *start.state.x.shape[1:]), start.t0.dtype)
         known = with_tangents(Known(P=nothing, early=nothing), (world, dt)) if loaded else None
-        (end, *_), _ = lax.scan(maybe, (start, resting, known, near, jnp.asarray(any(always))), phases)
-        return end
+        first = Progress(start, resting, known, near, jnp.asarray(any(always)))
+        return lax.scan(maybe, first, phases)[0].anchors
 
 
-def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, known: Known | None, dt: Array, phase: Array):
-    """One pass: anchors after it, contacts that rest, impulses that are known, whether any acted, whether any rests."""
-    impact, turn, push = (phase == kind for kind in (IMPACT, TURN, PUSH))
+class Progress(NamedTuple):
+    """What passes hand on."""
+
+    anchors: Anchors
+    resting: Array  # (C, *batch) bool: contacts that rest
+    known: Known | None
+    found: Array  # bool: the pass before had something to do in some world
+    rests: Array  # bool: some contact of some world rests
+
+
+def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
+    (anchors, resting, known, *_), (impact, turn, push) = now, (phase == kind for kind in (IMPACT, TURN, PUSH))
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
     strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
@@ -169,37 +168,60 @@ def _pass(world: Any, anchors: Anchors, launch: Callable, resting: Array, known:
 
     any_now = some(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
-    return anchors, resting, known, any_now, some(resting | strikes.rests)
+    return Progress(anchors, resting, known, any_now, some(resting | strikes.rests))
 
 
 def _demanded(
     world: Any, anchors: Anchors, flight: Flight, strikes: Strikes, resting: Array, dt: Array, phase: Array
 ) -> tuple[Strikes, Law, Array, Array]:
-    """What contacts demand in a pass: which take part, their law, for how long [s] they are held, and which rest."""
-    impact, turn, push = (phase == kind for kind in (IMPACT, TURN, PUSH))
-    drives = _flags(driven(world), dt[None])
+    """What contacts demand in a pass: which take part, their law, for how long [s] they are held, and which rest.
+
+    Struck is a contact whose turn it is: its normal velocity is to be restitution times that of closing, or 0 if it
+    comes to rest. Held is one that rests: it is not to close, but may where its gap is open.
+    """
+    push, drives = phase == PUSH, _flags(driven(world), dt[None])
+    u, closing = (-jax.vmap(dot)(strikes.normal, motion) for motion in (strikes.v_rel, strikes.pull))
     restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
-    u = -jax.vmap(dot)(strikes.normal, strikes.v_rel)
     if world.bodies.restitution_falloff is not None:
         restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
-    slow = u <= world.contact.rest_speed[None]
-    closing = -jax.vmap(dot)(strikes.normal, strikes.pull)
-    rests = slow | (2.0 * restitution * u <= closing * (dt[None] - strikes.s))
-    falls = u <= world.contact.rest_speed[None] + 2.0 * jnp.maximum(_fall(flight, dt)[None], closing * dt[None])
-    held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | falls)
-    found = resting | held | (strikes.active & ~strikes.held & (slow | (strikes.now & rests)))
-    held = jnp.where(push, resting & ~drives, held)
-    now, resting = held | (strikes.active & strikes.now), jnp.where(impact, found, jnp.where(turn, resting, held))
+    stays = comes_to_rest(u, restitution * u, closing, dt[None] - strikes.s, world.contact.rest_speed[None])
+    held, resting = _held(world, strikes, resting, stays, u <= _fallen(world, flight, closing, dt), phase)
     began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
     held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
     # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
     may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(strikes.gap, 0.0), held_for), 0.0)
-    at_rest = jnp.where(push | (strikes.gap <= 0), 0.0, may_close)
-    target, force = driving(world, jnp.where(held, at_rest, jnp.where(rests, 0.0, restitution * u)))
+    of_rest = jnp.where(push | (strikes.gap <= 0), 0.0, may_close)
+    of_impact = jnp.where(stays, 0.0, restitution * u)
+    target, force = driving(world, jnp.where(held, of_rest, of_impact))
     most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
     v_rel = jnp.where(push, strikes.gap[:, None] * strikes.normal, strikes.v_rel)
     law = Law(target, jnp.where(push, 0.0, friction), most)
+    now = held | (strikes.active & strikes.now)
     return replace(strikes, active=now, held=held, v_rel=v_rel), law, held_for, resting
+
+
+def _held(
+    world: Any, strikes: Strikes, resting: Array, stays: Array, fallen: Array, phase: Array
+) -> tuple[Array, Array]:
+    """Which contacts are held in this pass, and which rest after it, (C, *batch) bool.
+
+    Args:
+        resting: which rested before.
+        stays: which would come to rest if they were struck now.
+        fallen: which close no faster than after a step of free fall, so that they rested before it.
+    """
+    impact, drives = phase == IMPACT, _flags(driven(world), resting)
+    held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | fallen)
+    slow = -jax.vmap(dot)(strikes.normal, strikes.v_rel) <= world.contact.rest_speed[None]
+    comes = strikes.active & ~strikes.held & (slow | (strikes.now & stays))
+    held = jnp.where(phase == PUSH, resting & ~drives, held)
+    return held, jnp.where(impact, resting | held | comes, jnp.where(phase == TURN, resting, held))
+
+
+def _fallen(world: Any, flight: Flight, closing: Array, dt: Array) -> Array:
+    """Speed (C, *batch) [m/s] to which what rested has closed at most after a step of free fall of both bodies."""
+    fall = dt * jnp.sqrt((flight.a**2).sum(1).max(0))
+    return world.contact.rest_speed[None] + 2.0 * jnp.maximum(fall[None], closing * dt[None])
 
 
 def _choice(chosen: Array, new: Any, old: Any) -> Any:
@@ -210,8 +232,3 @@ def _choice(chosen: Array, new: Any, old: Any) -> Any:
 def _flags(flags: tuple[bool, ...], like: Array) -> Array:
     """Flags of contacts as an array with the batch axes of `like`, (C, 1, ...)."""
     return jnp.asarray(constant(flags, "bool")).reshape(len(flags), *[1] * (like.ndim - 1))
-
-
-def _fall(flight: Flight, dt: Array) -> Array:
-    """Speed of free fall after the step, (*batch) [m/s]: what closes no faster than twice that has rested before it."""
-    return dt * jnp.sqrt((flight.a**2).sum(1).max(0))

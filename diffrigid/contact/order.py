@@ -1,9 +1,8 @@
-"""What acts when: a body meets what it strikes first, and until then others hold it up.
+"""Ordering within a step: each body takes its first impact, and until then its supports hold it up.
 
-What hangs together, because it rests on each other or by joints, does not fall freely to the next impact of one of its
-bodies. A pass of its own holds it until then, as the end of a step does; the impact itself is that of a later pass.
-One without restitution then acts on all of them together, as far as there is none between them: passed on from each to
-the next it would never end. With restitution it is passed on (Newton's cradle).
+Bodies that rest on each other, or are joined, do not fall freely until one of them is struck: one pass holds them until
+then, as the end of a step does, and a later pass applies the impact. An inelastic impact acts on the whole cluster at
+once, because passed on from body to body it would never end. An elastic one is passed on, as in Newton's cradle.
 """
 
 from collections.abc import Callable
@@ -29,8 +28,8 @@ class Meeting:
     rests: Array = array("K")  # bool, of each contact: it touches from the start of the path on
     level: Any = array(default=None)  # [m] of the gap at which they meet
     slack: Any = array(default=None)  # [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size
-    now: Any = array(default=None)  # bool: is the turn of this impact
-    joins: Any = array(default=None)  # bool: is the turn of one that those which rest here take part in
+    now: Any = array(default=None)  # bool: this impact is handled in this pass
+    joins: Any = array(default=None)  # bool: what rests here takes part in an impact of this pass
     held: Any = array(default=None)  # bool: s is the time until which what rests is held
 
 

@@ -34,7 +34,7 @@ class Strikes:
     pull: Array = array("C", "D")  # [m/s^2] acceleration of a against b there
     rests: Array = array("C")  # bool: it touches from the start of the path on
     now: Array = array("C")  # bool: it is the turn of this impact
-    held: Array = array("C")  # bool: s is until when it is held, not an impact
+    held: Array = array("C")  # bool: s is the time until which it is held, not that of an impact
     drift: Array = array("C", "D")  # [m/s] half the velocity of a against b, of the centres; 0 at a static
     a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
     b: tuple[int, ...] = static(default=())

@@ -122,8 +122,9 @@ def _time_to(height: Array, v: Array, acc: Array) -> Array:
 def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array, at_end: Array) -> tuple[Array, Array]:
     """Advance until a contact is near and closing, or the step is over; and which contacts (K, *batch) rest.
 
-    Those touch, or are about to, no faster than `slow` [m/s], or beside such a one no faster than would rest anyway.
-    They are left out: in a flight without support they would be the next to close, and hide the fast impact of another.
+    Contacts rest that touch, or are about to, and close no faster than `slow` [m/s]; beside one, so do those slow
+    enough to come to rest anyway. They are left out: in unsupported flight they would always close next, and hide the
+    fast impact of another corner.
 
     Each advance is the least, over the contacts, of the gap over a bound on the closing speed for the present
     normal (Mirtich 1996), so that a body that only translates arrives in one. The gap of a corner and a plane is

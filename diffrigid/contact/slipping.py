@@ -37,11 +37,12 @@ def drift_after(strikes: Strikes, dv: Array) -> Array:
 
 
 def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
-    """What the impulses P, taken as even over T, move too little where the slip stops before: (C, D, *batch) [N s^2].
+    """Displacement that is missing where a slip stops early, as impulse times time: (C, D, *batch) [N s^2].
 
-    Friction first stops the slip with all of its bound, then holds against the pull, evenly. Stopping takes the
-    part of P that goes with the slip at the beginning, with its centroid at half the time tau until the stop instead
-    of T / 2: so it moves the contact by a further (T - tau) / 2. Exact for one direction of slip under a constant pull.
+    P is taken as spread evenly over T. In fact friction brakes with its full bound until the slip stops at tau, and
+    then only balances the pull. The braking part acts earlier, with its centroid at tau / 2 instead of T / 2, so it
+    moves the contact by a further (T - tau) / 2 of what it changes its velocity. Exact for one direction of slip under
+    a constant pull.
     """
     (part, bounds), most = rubbing(strikes, P, law), law.most
     at_end, slip = slips(part, strikes, law.target, T)

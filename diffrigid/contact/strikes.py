@@ -96,7 +96,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array, loaded: bool) -> S
     s, held, live = meeting.s, meeting.held, opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
     contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
-    # Those too that the next of a pile fell away from, which may close again once that is held, or struck.
+    # Also contacts that opened because the body below fell away: they may close again once it is held, or struck.
     opened = jnp.where(held | meeting.joins, dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None), 0.0)
     near = contacts.gap <= (meeting.level + meeting.slack + opened)[None]
     active = (near | (meeting.rests & held[None])) & meeting.hit[None]

@@ -12,7 +12,7 @@ from diffrigid.state import State
 from diffrigid.step import at_least_one
 from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
 from diffrigid.sysid.free import Chart, Each, Free, Prior
-from diffrigid.sysid.levenberg import Point, cost_of, levenberg
+from diffrigid.sysid.levenberg import INTERRUPTED, Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import split
@@ -34,7 +34,7 @@ from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 
 SQUARES = Squares()
-ALIKE = 0.5  # of the loss: a start that ends within this of the best one agrees with it
+ALIKE = 0.5, 1e-3  # of the loss, and of the best: a start that ends within both of the best one agrees with it
 
 
 def fit(
@@ -47,12 +47,12 @@ def fit(
     dt: float | None = None,
     noise: Mapping[str, Any] | None = None,
     observe: Mapping[str, Any] | None = None,
-    widths: Sequence[float] = (0.0,),
+    widths: Sequence[float] | None = None,
     windows: Sequence[float] = (np.inf,),
     loss: Any = SQUARES,
     solver: Callable | None = None,
     intervals: Intervals = from_jacobian,
-    iterations: int = 60,
+    iterations: int | None = None,
     seed: int = 0,
     resume: Any = None,
     progress: bool | None = None,
@@ -72,13 +72,14 @@ def fit(
             is estimated from the residuals.
         observe: what a column observes if its name does not say so: {"tip": Marker("rod", point=(0.3, 0))}.
         widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets
-            starts that miss an impact find it.
+            starts that miss an impact find it. Default that of the world, 0 unless it was given another.
         windows: [s] of each record from its start, one fit after the other: (0.5, 1, 2, inf) leads into a long one.
         loss: `diffrigid.sysid.squares()`, `dr.huber()` or `dr.student()`.
         solver: default Levenberg-Marquardt; for many numbers `diffrigid.sysid.first_order(optax.adam(1e-2))` or
             `diffrigid.sysid.lbfgs()`.
         intervals: `diffrigid.sysid.from_jacobian`, `dr.sandwich` or `dr.bootstrap`.
-        iterations: of Levenberg-Marquardt at most, for each width and window.
+        iterations: at most, for each width and window; default 60, of other solvers as they were made. A fit that
+            has not converged after them says so.
         seed: of the random starts.
         resume: an earlier Fit, or what `load_fit` read: the first start is there.
         progress: print a line as it goes; default: if the output is a terminal or a notebook.
@@ -97,31 +98,33 @@ def fit(
         (0.8, 0.0009)
     """
     began = time.time()
-    at_least_one("starts", starts), at_least_one("iterations", iterations)
-    stages = _stages(widths, windows)
+    at_least_one("starts", starts)
+    if iterations is not None:
+        at_least_one("iterations", iterations)
     _check_parts(loss, solver, intervals, seed, resume)
     check_mapping("observe", observe)
     problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
-    if world.crowd and max(widths) > 0:
+    stages = _stages((problem.width,) if widths is None else widths, windows)
+    if world.crowd and any(width > 0 for width, _ in stages):
         raise ValueError(f"widths is {widths!r}: expected (0.0,) for so many bodies; use fewer than 256")
     solve = levenberg if solver is None else solver
     z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)
-    estimate, stopped = bool(problem.noise), False
+    estimate, early = bool(problem.noise), ""
     point: Any = None
     for number, (width, window) in enumerate(stages):
         # Twice if noise is estimated: with the guess, then with what the residuals say.
         for again in range(2 if estimate and number == len(stages) - 1 else 1):
             noise_now = estimated_noise(problem, point, loss) if again else problem.noise
             problem = with_noise(problem, noise_now, window, width)
-            point, stopped = solve(problem.groups, z, loss, iterations, reach, report)
+            point, early = solve(problem.groups, z, loss, iterations, reach, report)
             z = point.z
-            if stopped:
+            if early == INTERRUPTED:
                 break
-        if stopped:
+        if early == INTERRUPTED:
             break
     report(-1, np.asarray(cost_of(loss, point.residuals)))
-    return finish(problem, point, loss, intervals, seed, began, ["interrupted: the best so far"] if stopped else [])
+    return finish(problem, point, loss, intervals, seed, began, [early] if early else [])
 
 
 def _stages(widths: Sequence[float], windows: Sequence[float]) -> list[tuple[float, float]]:
@@ -171,11 +174,11 @@ def finish(
     scenes = tuple(fitted_scenes(problem, shared, own))
     residuals = tuple(by_column(problem, point, best))
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals)
-    order = np.argsort(costs)
+    order, alike = np.argsort(costs), costs <= costs[best] + ALIKE[0] + ALIKE[1] * costs[best]
     summary = Summary(
         parameters=parameters, noise=_all_noise(problem), costs=costs[order],
         orders=impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum())),
-        agree=int((costs <= costs[best] + ALIKE + 1e-3 * costs[best]).sum()), notes=(*remarks, *notes), seed=seed,
+        agree=int(alike.sum()), notes=(*remarks, *notes), seed=seed,
         seconds=time.time() - began, versions=versions(),
     )  # fmt: skip
     return Fit(

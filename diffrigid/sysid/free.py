@@ -8,6 +8,7 @@ A kind of parameter is a frozen record with the verbs
     draw(reference, random)   z of a random start
     at_bound(value)           true if a result lies on a bound
     log_volume(z, reference)  log |d value / d z|: how much of the parameter a volume of z is
+    check(where, value)       raises ValueError for a start that the kind does not allow
     scale(reference)          (k,) a change of z that is large: what the data cannot tell is measured by it
 
 `each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds what is known beforehand.
@@ -26,7 +27,7 @@ from diffrigid import so2, so3
 from diffrigid.convert import coefficient, known_number, numbers
 
 NEAR_BOUND = 1e-3  # [-] of an interval: a start on a bound is pulled off it, a result this close is reported
-PULL = 1e-3  # a start at or below the bound of a positive parameter begins this far above it, in its unit
+PULL = 1e-3  # a start on the bound of a positive parameter begins this far above it, in its unit
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,10 @@ class Free:
         if np.isinf(self.low):
             return value.ravel()
         return np.log(np.where(value > self.low, value - self.low, PULL)).ravel()
+
+    def check(self, where: str, value: np.ndarray) -> None:
+        if not ((value >= self.low) & (value <= self.high)).all():
+            raise ValueError(f"{where} starts at {value}, expected from {self.low:g} to {self.high:g}: move the start")
 
     def draw(self, reference: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Uniform in an interval; a factor exp(spread N) about value - low if positive; normal with standard
@@ -96,6 +101,10 @@ class Chart:
 
     def value(self, z: Array, reference: Array) -> Array:
         return self.map(z, reference)
+
+    def check(self, where: str, value: np.ndarray) -> None:
+        if not value.any():
+            raise ValueError(f"{where} starts at {value}, expected a {self.name} that is not zero")
 
     def unbounded(self, reference: np.ndarray) -> np.ndarray:
         return np.zeros(self.size(np.shape(reference)))

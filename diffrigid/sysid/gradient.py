@@ -1,7 +1,7 @@
 """Solvers by reverse mode, for many free numbers: any first-order optimiser of optax, and L-BFGS with backtracking.
 
 A solver is a function of (groups, z, loss, iterations, reach, report) that returns the points found from the starts z,
-and whether the user interrupted; `levenberg` is one too. Each start keeps the best point that it has seen.
+and "", or why it ended early; `levenberg` is one too. Each start keeps the best point that it has seen.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ import optax
 from jax import Array
 
 from diffrigid.compiling import QUICK, uncollected
-from diffrigid.sysid.levenberg import Numbers, Point, point_at
+from diffrigid.sysid.levenberg import INTERRUPTED, UNFINISHED, Numbers, Point, point_at
 from diffrigid.sysid.problem import Group, Plan, residuals_of
 
 ARMIJO = 1e-4  # [-] of the decrease that the slope promises: what a step of L-BFGS has to achieve
@@ -24,48 +24,52 @@ STILL = 1e-10  # [-] relative decrease of the cost at which it ends
 
 
 def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Callable:
-    """Steps of an optimiser of optax on all starts at once: first_order(optax.adam(1e-2))."""
+    """Steps of an optimiser of optax on all starts at once: first_order(optax.adam(1e-2)).
 
-    def solve(groups, z, loss, iterations, reach, report) -> tuple[Point, bool]:
-        del iterations
+    As many as `fit` is given `iterations`, or else `steps`.
+    """
+
+    def solve(groups, z, loss, iterations, reach, report) -> tuple[Point, str]:
         state, best, move = optimiser.init(z), None, jax.jit(_as_optax_does(optimiser.update))
         try:
-            for count in range(steps):
+            for count in range(steps if iterations is None else iterations):
                 cost, slope = cost_and_slope(groups, z, loss)
                 best = _best(best, (cost, z))
                 report(count, np.asarray(best[0]))
                 change, state = move(_held(slope, reach), state, z)
                 z = jax.tree.map(jnp.add, z, change)
         except KeyboardInterrupt:
-            return point_at(groups, best[1] if best else z), True
+            return point_at(groups, best[1] if best else z), INTERRUPTED
         best = _best(best, (cost_and_slope(groups, z, loss)[0], z))
-        return point_at(groups, best[1]), False
+        return point_at(groups, best[1]), ""
 
     return solve
 
 
 def lbfgs(steps: int = 200, memory: int = 10) -> Callable:
-    """L-BFGS of optax, each start on its own, with steps halved until they gain (Armijo)."""
+    """L-BFGS of optax, each start on its own, with steps halved until they gain (Armijo).
+
+    At most as many as `fit` is given `iterations`, or else `steps`.
+    """
     scale = optax.scale_by_lbfgs(memory_size=memory)
 
-    def solve(groups, z, loss, iterations, reach, report) -> tuple[Point, bool]:
-        del iterations
-        flat = _flat(z)
+    def solve(groups, z, loss, iterations, reach, report) -> tuple[Point, str]:
+        flat, most = _flat(z), steps if iterations is None else iterations
         state = jax.vmap(scale.init)(flat)
         cost, slope = cost_and_slope(groups, z, loss)
         try:
-            for count in range(steps):
+            for count in range(most):
                 report(count, np.asarray(cost))
                 gradient = _flat(_held(slope, reach))
                 change, state = _direction(scale, gradient, state, flat)
                 flat, new, slope = _line_search(groups, z, loss, flat, -change, cost, gradient)
-                ended = bool(jnp.all(cost - new <= STILL * jnp.abs(cost)))
+                ended = cost - new <= STILL * jnp.abs(cost)
                 cost = new
-                if ended:
+                if bool(ended.all()):
                     break
         except KeyboardInterrupt:
-            return point_at(groups, _unflat(flat, z)), True
-        return point_at(groups, _unflat(flat, z)), False
+            return point_at(groups, _unflat(flat, z)), INTERRUPTED
+        return point_at(groups, _unflat(flat, z)), "" if bool(ended[jnp.argmin(cost)]) else UNFINISHED.format(most)
 
     return solve
 

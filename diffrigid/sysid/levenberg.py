@@ -20,8 +20,11 @@ from diffrigid.compiling import QUICK
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.problem import Group, linearise
 
-STIFF = 1e7  # a damping at which no step is taken any more
-SMALL = 1e-9  # a decrease still to be had, relative to the cost of one residual, that is nothing
+STIFF = 1e7  # a damping above which a start counts as converged
+SMALL = 1e-9  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
+ITERATIONS = 60  # at most, unless another number is asked for
+INTERRUPTED = "interrupted: the best so far"
+UNFINISHED = "not converged after {} iterations: raise iterations, or start elsewhere"
 
 
 class Numbers(NamedTuple):
@@ -198,10 +201,10 @@ def _in_order(members: tuple[tuple[int, ...], ...], parts: Sequence[Array]) -> A
 
 
 def levenberg(
-    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int, reach: Numbers,
+    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int | None, reach: Numbers,
     report: Callable[[int, np.ndarray], None],
-) -> tuple[Point, bool]:  # fmt: skip
-    """The lowest points found from the starts z, and whether the user interrupted.
+) -> tuple[Point, str]:  # fmt: skip
+    """The lowest points found from the starts z, and "", or why it ended before the best of them converged.
 
     Starts whose residuals are not finite stay where they are, at infinite cost. Ends when no start has anything to
     gain any more.
@@ -214,22 +217,23 @@ def levenberg(
 
 
 def minimise(
-    at: Callable[[Numbers], Point], members: tuple[tuple[int, ...], ...], z: Numbers, loss: Any, iterations: int,
-    reach: Numbers, report: Callable[[int, np.ndarray], None],
-) -> tuple[Point, bool]:  # fmt: skip
+    at: Callable[[Numbers], Point], members: tuple[tuple[int, ...], ...], z: Numbers, loss: Any,
+    iterations: int | None, reach: Numbers, report: Callable[[int, np.ndarray], None],
+) -> tuple[Point, str]:  # fmt: skip
     """As `levenberg`, of any residuals: `at` gives them and their Jacobians, for groups of the records `members`."""
-    trial = at(z)
+    trial, iterations = at(z), ITERATIONS if iterations is None else iterations
     progress = Progress(trial, *_nothing_yet(z.own))
     try:
         for count in range(iterations + 1):
             progress, z = update(loss, members, progress, trial, reach)
-            report(count, np.asarray(progress.cost).sum(0))
-            if count == iterations or np.asarray(progress.done).all():
+            report(count, costs := np.asarray(progress.cost).sum(0))
+            done = np.asarray(progress.done)
+            if count == iterations or done.all():
                 break
             trial = at(z)
     except KeyboardInterrupt:
-        return progress.point, True
-    return progress.point, False
+        return progress.point, INTERRUPTED
+    return progress.point, "" if done[:, costs.argmin()].all() else UNFINISHED.format(iterations)
 
 
 @jax.jit

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -60,7 +61,7 @@ def write(scene: Scene, path: str, value: Array) -> Scene:
 
 def knows(scene: Scene, path: str) -> bool:
     """True if the scene has such a parameter."""
-    return path in channel_paths(scene.channels) or path in paths._catalogue(scene.world)
+    return path in channel_paths(scene.channels) or paths.component(path)[0] in paths.catalogue(scene.world)
 
 
 def reference(slot: Slot, scene: Scene) -> Array:
@@ -90,10 +91,13 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
     """The parameters that all records share, and those of which each has its own.
 
     Raises:
-        ValueError: nothing is free, a kind is none, or a path is in no scene.
+        ValueError: nothing is free, a kind is none, a path is in no scene, two name the same numbers, or the value in
+            a scene is none that the kind allows.
     """
     if not isinstance(free, Mapping) or not free:
         raise ValueError('free: nothing to fit; give paths, for example {"restitution": interval(0, 1)}')
+    # Records have mostly the same parameters.
+    unlike = list({(jax.tree.structure((s.world, s.state)), tuple(s.channels)): s for s in scenes}.values())
     shared: list[Slot] = []
     own: list[Slot] = []
     for key, kind in free.items():
@@ -111,23 +115,54 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
         having = [scene for scene in scenes if all(knows(scene, name) for name in names)]
         if not having or several and len(having) < len(scenes):
             _refuse(names, having, scenes)
+        _refuse_ambiguous(names, unlike)
         slot = Slot(" = ".join(names), names, kind, 0, known)
         shape = reference(slot, having[0]).shape
         size = kind.size(shape)
+        for scene in having:
+            kind.check(f"free[{key!r}]", np.asarray(reference(slot, scene)))
         if known is not None and len(known.mean) not in (1, int(np.prod(shape))):
             raise ValueError(
                 f"free[{key!r}]: a prior with {len(known.mean)} means, expected those of the shape {shape}"
             )
         name = slot.name.replace(" = ", " : ") if slot.joint else slot.name
         (own if several else shared).append(Slot(name, names, kind, size, known))
+    for scene in unlike:
+        _refuse_overlaps([*shared, *own], scene)
     return tuple(shared), tuple(own)
+
+
+def _refuse_ambiguous(names: tuple[str, ...], scenes: Sequence[Scene]) -> None:
+    """Raise ValueError for paths that the fit itself sets, or that name two things."""
+    for name in names:
+        if name == "contact.width":
+            raise ValueError("free: 'contact.width' is no property of a body: give fit the widths to go through")
+        if any(
+            name in channel_paths(s.channels) and paths.component(name)[0] in paths.catalogue(s.world) for s in scenes
+        ):
+            raise ValueError(
+                f"free: {name!r} is a parameter of the world and of a column: give the column another name"
+            )
+
+
+def _refuse_overlaps(slots: Sequence[Slot], scene: Scene) -> None:
+    """Raise ValueError if two paths set the same number."""
+    known, of_columns = paths.catalogue(scene.world), channel_paths(scene.channels)
+    taken: dict[tuple, list[tuple[Any, Any, str]]] = {}
+    for path in (path for slot in slots for path in slot.paths if path not in of_columns):
+        whole, index = paths.component(path)
+        for place in known.get(whole, []):
+            for row, item, other in taken.setdefault(place.chain, []):
+                if all(a is None or b is None or a == b for a, b in ((row, place.row), (item, index))):
+                    raise ValueError(f"free: {other!r} and {path!r} set the same number: leave one out")
+            taken[place.chain].append((place.row, index, path))
 
 
 def _refuse(names: tuple[str, ...], having: Sequence[Scene], scenes: Sequence[Scene]) -> None:
     for name in names:
         lacking = [scene for scene in scenes if not knows(scene, name)]
         if lacking:
-            catalogue = [*channel_paths(lacking[0].channels), *paths._catalogue(lacking[0].world)]
+            catalogue = [*channel_paths(lacking[0].channels), *paths.catalogue(lacking[0].world)]
             where = "this world" if not having else "the scene of every record, as a parameter of `each` has to be"
             raise ValueError(f"free: no parameter {name!r} in {where}: {nearest(name, catalogue)}")
     raise ValueError(f"free: no scene has all of {names}: tie only what is in one scene")

@@ -230,8 +230,8 @@ def linearised(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
 
     At z (n, R, S), R records and S starts, by forward mode. Motions are states (steps + 1, ..., R, S).
 
-    The n directions lie on the last axis too, each with the state beside it: it costs some more to run than to share
-    the state among them, and half as much to trace.
+    The n directions are lanes of the last axis too, each with its own copy of the state: slightly slower to run than
+    one shared state, and twice as fast to trace.
     """
     n, R, S = z.shape
     wide = jnp.broadcast_to(z[:, None], (n, n, R, S)).reshape(n, -1)

@@ -58,7 +58,7 @@ class Fit:
     linear: Linear
     uncertainty: Uncertainty  # of the shared numbers z
     residuals: tuple[dict[str, np.ndarray], ...]  # of each record by column, (K, size), in standard deviations
-    starts: np.ndarray  # (a, starts) z of the shared numbers where every start ended, as `order` has them
+    starts: np.ndarray  # (a, starts) z of the shared numbers where every start ended, the best first, as `costs`
     loss: Any
 
     @property
@@ -153,12 +153,12 @@ class Fit:
         iterations = SCORED if problem.own else 0
         point, _ = levenberg(problem.groups, z, self.loss, iterations, reach, lambda count, costs: None)
         best = best_by_record(problem.groups, point, self.loss)
-        found = [by_column(problem, point, start)[k] for k, start in enumerate(best)]
-        out = {}
-        for name, sigma in problem.noise.items():
-            values = np.concatenate([sigma * columns[name].ravel() for columns in found if name in columns])
-            out[name] = float(np.sqrt(np.nanmean(values**2)))
-        return out
+        found = [by_column(problem, point, start, in_units=True)[k] for k, start in enumerate(best)]
+        names = dict.fromkeys(name for columns in found for name in columns)
+        values = {
+            name: np.concatenate([columns[name].ravel() for columns in found if name in columns]) for name in names
+        }
+        return {name: float(np.sqrt(np.nanmean(residuals**2))) for name, residuals in values.items()}
 
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""

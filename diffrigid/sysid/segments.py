@@ -134,7 +134,7 @@ def jumps(fit: Fit) -> dict[str, np.ndarray]:
 def _initial(world: World, key: Any) -> bool:
     """True for a path, or a tuple of paths, into the initial state."""
     names = [key] if isinstance(key, str) else key
-    known = paths._catalogue(world)
+    known = paths.catalogue(world)
     return any(place.chain[0] == 1 for name in names for place in known.get(name, []))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from diffrigid.convert import numbers
 from diffrigid.devices import everywhere
+from diffrigid.paths import write as write_path
 from diffrigid.state import State
 from diffrigid.step import floats
 from diffrigid.sysid.covariance import Linear
@@ -39,6 +40,7 @@ class Problem:
     own: tuple[Slot, ...]
     groups: tuple[Group, ...]
     dt: float  # [s] the longest step
+    width: float  # [m] of smooth impacts
     noise: dict[str, float]  # of columns whose noise is not given with their record
     free: Mapping[Any, Any]  # as the user gave it
     observe: Mapping[str, Any]  # likewise
@@ -74,8 +76,18 @@ def make_problem(
     shared, own = make_slots(free, [scene_of(run) for run in found])
     longest = longest_step(found, dt)
     groups = make_groups(found, (*shared, *own), len(shared), longest)
-    problem = Problem(tuple(found), shared, own, tuple(groups), longest, {}, dict(free), dict(observe or {}))
+    problem = Problem(
+        tuple(found), shared, own, tuple(groups), longest, _common_width(found), {}, dict(free), dict(observe or {})
+    )
     return with_noise(problem, _noise_guesses(found))
+
+
+def _common_width(found: Sequence[Run]) -> float:
+    """[m] of the smooth impacts of all worlds."""
+    widths = sorted({float(run.world.contact.width) for run in found})
+    if len(widths) > 1:
+        raise ValueError(f"the worlds of the records have contact.width {widths}: expected the same in all of them")
+    return widths[0]
 
 
 def scene_of(run: Run) -> Scene:
@@ -83,12 +95,15 @@ def scene_of(run: Run) -> Scene:
     return Scene(run.world, run.state, run.channels)
 
 
-def with_noise(problem: Problem, noise: Mapping[str, float], window: float = np.inf, width: float = 0.0) -> Problem:
-    """The problem with weights for this noise, for the first `window` [s] of each record, and impacts this smooth [m].
+def with_noise(
+    problem: Problem, noise: Mapping[str, float], window: float = np.inf, width: float | None = None
+) -> Problem:
+    """The problem with weights for this noise, for the first `window` [s] of each record.
 
-    Until one is smooth, none is compiled to be.
+    Args:
+        width: [m] of smooth impacts; None: as it is. Until one is smooth, none is compiled to be.
     """
-    groups = []
+    groups, width = [], problem.width if width is None else float(width)
     for group in problem.groups:
         weights = {}
         for name, old in group.data.weights.items():
@@ -98,7 +113,7 @@ def with_noise(problem: Problem, noise: Mapping[str, float], window: float = np.
         width_now = None if exact else jnp.asarray(width, group.data.lengths.dtype)
         data = group.data._replace(weights=weights, width=width_now)
         groups.append(replace(group, data=data))
-    return replace(problem, groups=tuple(groups), noise=dict(noise))
+    return replace(problem, groups=tuple(groups), noise=dict(noise), width=width)
 
 
 def _weights(run: Run, name: str, noise: Mapping[str, float], window: float, rows: int) -> np.ndarray:
@@ -257,7 +272,9 @@ def fitted_scene(problem: Problem, group: Group, k: int, shared: np.ndarray, own
     """Of record k of a group."""
     run = problem.runs[group.members[k]]
     z = np.concatenate([shared, own[:, group.members[k]]]).astype(run.state.x.dtype)
-    return _put(group.plan.slots, scene_of(run), z)
+    scene = _put(group.plan.slots, scene_of(run), z)
+    world, state = write_path(scene.world, scene.state, "contact.width", problem.width)
+    return scene._replace(world=world, state=state)
 
 
 _put = jax.jit(put, static_argnames="slots")
@@ -306,8 +323,8 @@ def row_mask(problem: Problem, group: Group, k: int, rows: int) -> tuple[np.ndar
     return np.concatenate([used, np.ones(priors, bool)]), np.concatenate([t, np.full(priors, np.nan)])
 
 
-def by_column(problem: Problem, point: Point, best: int) -> list[dict[str, np.ndarray]]:
-    """Residuals in standard deviations of every record, by column, (K, size), NaN where missing."""
+def by_column(problem: Problem, point: Point, best: int, in_units: bool = False) -> list[dict[str, np.ndarray]]:
+    """Residuals of every record, by column, (K, size), NaN where missing; in standard deviations, or `in_units`."""
     out: list[Any] = [None] * len(problem.runs)
     for group, r in zip(problem.groups, point.residuals, strict=True):
         values = np.asarray(r, float)[..., best]
@@ -316,7 +333,7 @@ def by_column(problem: Problem, point: Point, best: int) -> list[dict[str, np.nd
             for name, weights in group.data.weights.items():
                 w = np.asarray(weights)[..., k if weights.shape[-1] > 1 else 0]
                 piece = values[first : first + w.size, k].reshape(w.shape)
-                found[name] = np.where(w > 0, piece, np.nan)
+                found[name] = np.where(w > 0, piece / (np.where(w > 0, w, 1.0) if in_units else 1.0), np.nan)
                 first += w.size
             out[member] = found
     return out

@@ -4,7 +4,6 @@ What a slider moves is an argument of one compiled program, so a new motion take
 the motion itself, and where its derivative by the parameter moved last says that it goes, a straight line ahead.
 """
 
-import re
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -40,7 +39,11 @@ class Explorer:
         self.ranges = {name: _range(name, span) for name, span in ranges.items()}
         run = partial(_with_slope, tuple(ranges), dt=dt, steps=at_least_one("steps", steps))
         self._run = uncollected(jax.jit(run, compiler_options=QUICK))
-        self.values = {name: float(_number(*self._start, name)) for name in self.ranges}
+        read = {name: paths.read(*self._start, name) for name in self.ranges}
+        for name, value in read.items():
+            if jnp.ndim(value):
+                raise ValueError(f"{name} is no number, it has the shape {value.shape}: choose one, as in '{name}[0]'")
+        self.values = {name: float(value) for name, value in read.items()}
         for name, (low, high) in self.ranges.items():
             if not low <= self.values[name] <= high:
                 raise ValueError(f"{name} is {self.values[name]:g}, outside its range ({low:g}, {high:g})")
@@ -69,7 +72,7 @@ class Explorer:
 
     def unit(self, name: str) -> str:
         """SI unit of a parameter."""
-        return paths.unit(self.trajectory.world, _split(name)[0])
+        return paths.unit(self.trajectory.world, name)
 
     def sliders(self) -> list[dict[str, Any]]:
         """What the sliders show."""
@@ -103,9 +106,8 @@ def explore(
 ) -> Explorer:
     """Sliders for parameters of a scene, beside the motion, which follows as they are dragged, and its slope.
 
-    The slope is drawn as a second motion: where the derivative by the parameter that was moved last says that bodies
-    would be if it grew by a twentieth of its range. Where both part, at an impact that appears or vanishes, the
-    motion is no straight line.
+    The slope is drawn as a second motion: the linear prediction of where bodies would be if the parameter moved last
+    grew by a twentieth of its range. Where the two diverge, as at an impact that appears or vanishes, it fails.
 
     Args:
         ranges: lowest and highest value of each parameter by its path, "restitution", "ball.mass" or "ball.v[0]".
@@ -134,28 +136,6 @@ def _range(name: str, span: Any) -> tuple[float, float]:
     return low, high
 
 
-def _split(name: str) -> tuple[str, int | None]:
-    """Path and component: "ball.v[0]" is ("ball.v", 0)."""
-    match = re.fullmatch(r"(.+)\[(\d+)\]", name)
-    return (match[1], int(match[2])) if match else (name, None)
-
-
-def _number(world: World, state: State, name: str) -> Array:
-    path, component = _split(name)
-    value = jnp.asarray(paths.read(world, state, path))
-    if component is None and value.ndim == 0:
-        return value
-    if value.ndim != 1 or component is None or component >= len(value):
-        raise ValueError(f"{name} is no number, {path} has the shape {value.shape}: choose one, as in '{path}[0]'")
-    return value[component]
-
-
-def _put(world: World, state: State, name: str, number: Array) -> tuple[World, State]:
-    path, component = _split(name)
-    value = number if component is None else paths.read(world, state, path).at[component].set(number)
-    return paths.write(world, state, path, value)
-
-
 def _with_slope(
     names: tuple[str, ...], world: World, state: State, values: Array, ahead: Array, *, dt: float, steps: int
 ) -> tuple[Trajectory, Trajectory]:
@@ -164,7 +144,7 @@ def _with_slope(
     def path(values: Array) -> Trajectory:
         changed = world, state
         for name, number in zip(names, values, strict=True):
-            changed = _put(*changed, name, number)
+            changed = paths.write(*changed, name, number)
         return rollout(*changed, dt=dt, steps=steps)
 
     dtype = state.x.dtype

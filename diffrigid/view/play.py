@@ -129,9 +129,10 @@ def _check(runs: Mapping[str, Trajectory], show: Iterable[str], theme: str, spee
         raise ValueError(f"play: expected speed > 0 and frames >= 2, got {speed} and {frames}")
 
 
-def _data_by_run(runs: Mapping[str, Trajectory], data: Mapping[str, Any] | None, beside: bool) -> dict[str, Any]:
+def _data_by_run(runs: Mapping[str, Trajectory], data: Any, beside: bool) -> dict[str, Any]:
     """The columns of each trajectory: by name, or the same for all, which are drawn once."""
-    if data is not None and "t" not in data and data and all(isinstance(part, Mapping) for part in data.values()):
+    by_name = isinstance(data, Mapping) and "t" not in data and data
+    if by_name and all(isinstance(part, Mapping) for part in data.values()):
         if unknown := set(data) - set(runs):
             raise ValueError(f"data has {sorted(unknown)}: expected names of trajectories, {sorted(runs)}")
         return {name: data.get(name) for name in runs}
