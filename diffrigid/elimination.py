@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.numerics import apart, opaque_true, rows_or_zeros
+from diffrigid.numerics import opaque_true, rows_or_zeros, unfused
 
 ROUNDING = 1e2  # times the spacing of numbers at the diagonal: a pivot of a loop that is no larger is zero
 
@@ -152,7 +152,7 @@ def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
     factors, live = [], opaque_true(blocks)
     for level in plan.levels:
         own = rows_or_zeros(blocks, level.blocks)
-        inverse, near = apart(live, _inverse, own[:, 0], rows_or_zeros(tiny, level.pivots)), own[:, 1:]
+        inverse, near = unfused(live, _inverse, own[:, 0], rows_or_zeros(tiny, level.pivots)), own[:, 1:]
         ready = _product(inverse[:, None], near, 2)
         factors.append(Factor(inverse, ready))
         if level.kept:

@@ -31,7 +31,7 @@ from diffrigid.constraints import (
 )
 from diffrigid.elimination import Factor, factorise, plan, substitute
 from diffrigid.joints import Pose
-from diffrigid.numerics import apart, dot, opaque_true, rows_or_zeros
+from diffrigid.numerics import dot, opaque_true, rows_or_zeros, unfused
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, rotations
 
@@ -73,7 +73,7 @@ def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> 
     groups, live = placed(joints, statics, x, q), opaque_true(x)
     inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q)
     inverse_mass = 1.0 / bodies.mass
-    sides = apart(live, functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
+    sides = unfused(live, functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
     blocks = _blocks(so, ends, sides, *lax.stop_gradient((inverse_mass, inverse)))
     return Linkage(
         groups=groups, sides=sides, factors=factorise(plan(ends, len(x)), blocks), inverse_mass=inverse_mass,
@@ -168,7 +168,7 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench, span: Array) -> Wrench:
     """The forces of a world with those added that keep its joints, for an integration over span (*batch) [s]."""
-    state = apart(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
+    state = unfused(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
     given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1), span)
@@ -178,7 +178,7 @@ def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wren
     def falling(groups: tuple[Placed, ...], twists: Array, free: Array) -> Array:
         return joint_accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
 
-    target = apart(opaque_true(state.x), falling, link.groups, _twists(state), free)
+    target = unfused(opaque_true(state.x), falling, link.groups, _twists(state), free)
     forces = given + _pull(link, _multipliers(link, target))
     return Wrench(F=forces[:, : so.D], tau=forces[:, so.D :])
 
@@ -225,7 +225,7 @@ def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> St
 
     Both by J at the poses as they come, so that the velocities are then on the joints up to the displacement.
     """
-    state = apart(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
+    state = unfused(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     off = jnp.stack([joint_errors(so, link.groups), _rates(link, _twists(state))])
     moved, kicked = jax.vmap(lambda off: _moved(link, _pull(link, _multipliers(link, off))))(off)

@@ -150,7 +150,7 @@ def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]
 
 
 @jax.custom_batching.custom_vmap
-def some(flags: Array) -> Array:
+def any_world(flags: Array) -> Array:
     """Whether any flag is set, in any of the worlds, a bool: what branches and loops depend on.
 
     Of all the worlds under `jax.vmap` as well, which else makes of every branch a choice between two results that are
@@ -159,18 +159,18 @@ def some(flags: Array) -> Array:
     return jnp.any(flags)
 
 
-@some.def_vmap
+@any_world.def_vmap
 def _some_of_all(size: int, batched: list[bool], flags: Array) -> tuple[Array, bool]:
     del size, batched
-    return some(flags), False
+    return any_world(flags), False
 
 
 def opaque_true(like: Array) -> Array:
-    """True, in a form that the compiler cannot know; see `apart`. `like`: any array of the program, not infinite."""
-    return some(~(jnp.ravel(like)[:1] > jnp.inf))
+    """True, in a form that the compiler cannot know; see `unfused`. `like`: any array of the program, not infinite."""
+    return any_world(~(jnp.ravel(like)[:1] > jnp.inf))
 
 
-def apart(live: Array, fn: Callable, *args: Any) -> Any:
+def unfused(live: Array, fn: Callable, *args: Any) -> Any:
     """fn(*args), computed by itself: XLA does not fuse across a branch.
 
     Where several results depend on one, XLA on a CPU computes it again inside each of them, and again for each
@@ -287,7 +287,7 @@ def solve_regular(matrix: Array, right: Array) -> Array:
     return jnp.moveaxis(jnp.where(jnp.isfinite(x), x, 0.0), (-2, -1), (0, 1))
 
 
-def times(matrix: Array, u: Array) -> Array:
+def matvec(matrix: Array, u: Array) -> Array:
     """(R, R, *batch) times (R, *batch)."""
     parts = matrix * u[None]
     return fold(jnp.add, parts, 1) if len(u) <= MANY else parts.sum(1)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import components, cos_sin, dot, safe_sqrt, some
+from diffrigid.numerics import any_world, components, cos_sin, dot, safe_sqrt
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
@@ -198,7 +198,7 @@ def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
         return jnp.concatenate([w[None], jnp.zeros((SERIES_ORDER - 1, *w.shape), w.dtype)])
 
     wanders = dot(twist, twist) > (16.0 * jnp.finfo(w.dtype).eps) ** 2 * size
-    return lax.cond(some(wanders), partial(_whole_series, tau=None), first, inverse, q, L)
+    return lax.cond(any_world(wanders), partial(_whole_series, tau=None), first, inverse, q, L)
 
 
 @turn_series.defjvp

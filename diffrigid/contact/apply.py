@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.contact.anchors import Anchors, struck
-from diffrigid.contact.known import Known, beside, loads, turning_back
+from diffrigid.contact.known import Known, beside, loads, reversing
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
 from diffrigid.contact.order import over_islands
 from diffrigid.contact.resting import Law, Strikes, solve_impulses
@@ -45,7 +45,7 @@ def apply_impulses(
         held_for: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
 
     Returns:
-        the anchors; where impulses are `known`, those of friction that turns, and what undoes the loads.
+        the anchors; where impulses are `known`, those of friction that reverses, and what undoes the loads.
     """
     moving, active, held = flight.t0.shape[0], strikes.active.astype(kick.dtype), strikes.held.astype(kick.dtype)
     each = jnp.stack([active, active * strikes.s, held], axis=1)
@@ -64,7 +64,7 @@ def apply_impulses(
     if known is not None:
         P, early_P = P + known.P, early_P + known.early
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    turns = None if known is None else turning_back(strikes, P, (dv, dw), law, held_for)
+    friction = None if known is None else reversing(strikes, P, (dv, dw), law, held_for)
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
     kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
@@ -74,23 +74,23 @@ def apply_impulses(
         kicked = kicked[0] + onto[0], kicked[1] + onto[2]
     # The path from where a body was held until, followed backwards, is its own but to second order.
     since = jnp.where(count > 0, jnp.where((kick > 0) & (evenly > 0), flight.t0, t), anchors.since)
-    return _anchored(flight, t, q, since, kicked, moved), turns, load
+    return _anchored(flight, t, q, since, kicked, moved), friction, load
 
 
 def _solved(
     world: Any, at: tuple[Flight, Array, Mobility], strikes: Strikes, law: Law, kick: Array, held_for: Array,
-    known: Known | None, crowd: Array,
+    known: Known | None, count: Array,
 ) -> tuple[Strikes, Law, Array, Array, Array]:  # fmt: skip
     """Strikes, law and times with the rows of rolling, impulses that are not known, and what stops early of them."""
     (flight, t, mobility), stopped = at, stopping_early
     if is_rolling(world):
         strikes, law, held_for = with_rows(world, strikes, law, held_for, flight, t, mobility, kick)
         acting = strikes.active.astype(kick.dtype)
-        crowd = side_sum(acting, acting, strikes.a, strikes.b, flight.t0.shape[0])
+        count = side_sum(acting, acting, strikes.a, strikes.b, flight.t0.shape[0])
         stopped = rolling_stops
     if known is not None:
         strikes, law = beside(mobility, strikes, law, known)
-    P = solve_impulses(strikes, law, mobility, crowd, world.contact.rest_speed)
+    P = solve_impulses(strikes, law, mobility, count, world.contact.rest_speed)
     return strikes, law, held_for, P, stopped(mobility, strikes, P, law, held_for)
 
 

@@ -25,7 +25,7 @@ from diffrigid.contact.impulse import impulses
 from diffrigid.contact.sides import Side
 from diffrigid.contact.strikes import Material, law, materials, next_strikes
 from diffrigid.flight import launch, orientation, state_at
-from diffrigid.numerics import FOUND, dot, norm, rows, some
+from diffrigid.numerics import FOUND, any_world, dot, norm, rows
 from diffrigid.pytree import map_arrays, pytree, replace
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State, rotations
@@ -177,7 +177,7 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
         flight = jax.tree.map(lambda leaf: leaf[0], launch(crowd.world, anchors.state, None, anchors.t0, crowd.dt))
         bodies = Side(flight=flight, since=anchors.since[0], shape=crowd.shape)
         following = checkpoint_name(_next(crowd, walls, near, lax.stop_gradient(bodies)), FOUND)
-        any_there = some(following.there)
+        any_there = any_world(following.there)
         after = lax.cond(any_there, lambda a: _meet(crowd, walls, following, bodies, a), lambda a: a, anchors)
         return after, any_there
 

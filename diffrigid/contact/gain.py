@@ -20,7 +20,7 @@ from diffrigid.contact.mobility import Arms, Mobility, moved
 from diffrigid.contact.order import Links, hanging_together
 from diffrigid.contact.sides import at_pairs, pair_sum, pairs_of
 from diffrigid.contact.together import solve_together
-from diffrigid.numerics import dot, some
+from diffrigid.numerics import any_world, dot
 from diffrigid.pytree import replace
 
 
@@ -32,14 +32,14 @@ def solve_without_gain(cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility)
     bounces = jnp.where(cone.target > 0, cone.on, 0.0)
     if cone.most is not None:
         bounces = jnp.where(jnp.isinf(cone.most), bounces, 0.0)
-    any_bounce = some(bounces > 0)
+    any_bounce = any_world(bounces > 0)
 
     def gaining(P: Array) -> Array:
         P, v = lax.stop_gradient((P, v_rel))
         T = jax.vmap(dot)(P, v + 0.5 * lax.stop_gradient(moved(P, arms, mobility)))
         least = jnp.finfo(v.dtype).eps ** 0.6 * jnp.abs(P * v).sum((0, 1))
         over, struck = _summed(cone, arms, mobility, T, lax.stop_gradient(bounces))
-        return some((over > least[None]) & (struck > 0))
+        return any_world((over > least[None]) & (struck > 0))
 
     def one(needed: Array, rough: Array) -> tuple[Array, tuple[Array, Array]]:
         spin = None if cone.spin is None else rough * cone.spin
@@ -57,7 +57,7 @@ def solve_without_gain(cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility)
         return P0 + kappa[:, None] * both[1]
 
     # Both solutions in one loop, so that the method is compiled once.
-    _, ((P, P0), (gains, _)) = lax.scan(one, some(cone.on > 0), jnp.array([1.0, 0.0], v_rel.dtype))
+    _, ((P, P0), (gains, _)) = lax.scan(one, any_world(cone.on > 0), jnp.array([1.0, 0.0], v_rel.dtype))
     return lax.cond(gains, between, lambda P, _: P, P, P0)
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import some
+from diffrigid.numerics import any_world
 
 CELLS = 4  # for each body
 SPREAD = 2.5  # [-] standard deviations that the grid reaches to both sides; who is farther counts as on its edge
@@ -50,7 +50,7 @@ def neighbours(x: Array, reach: Array, worlds: int, most: int) -> Near:
 
     start = jnp.zeros_like(me[0]), jnp.full_like(room, -1), jnp.zeros_like(me)
     longest = ends[-1].max()
-    _, other, count = lax.while_loop(lambda carry: some(carry[0] < longest), look, start)
+    _, other, count = lax.while_loop(lambda carry: any_world(carry[0] < longest), look, start)
     return Near(other, count)
 
 

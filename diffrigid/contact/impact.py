@@ -29,7 +29,6 @@ from diffrigid.contact.sides import (
 )
 from diffrigid.numerics import (
     FOUND,
-    apart,
     dot,
     implicit_root,
     norm,
@@ -38,6 +37,7 @@ from diffrigid.numerics import (
     safe_divide,
     safe_sqrt,
     softplus,
+    unfused,
 )
 from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere
 from diffrigid.state import rotations
@@ -60,7 +60,7 @@ def find_impact(
     live, begin = opaque_true(t1), earliest(a, b)[0]
     varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
     if closed_form(a.shape, b.shape, straight) and not varying:
-        s0, level, found, _ = apart(live, approach, a, b, width)
+        s0, level, found, _ = unfused(live, approach, a, b, width)
         rests = _round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
     else:
         s0, level, found, rests = approach_search(a, b, t1, width, rest_speed, at_end)

@@ -22,7 +22,7 @@ from jax import Array
 
 from diffrigid.contact.levers import Levers
 from diffrigid.contact.sides import Placed
-from diffrigid.numerics import dot, safe_divide, safe_sqrt
+from diffrigid.numerics import dot, matvec, safe_divide, safe_sqrt
 from diffrigid.so2 import perp
 from diffrigid.so3 import tangents
 from diffrigid.state import rotations
@@ -67,11 +67,6 @@ def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
     return K - jax.vmap(lambda row: rotations(len(K)).cross(lever.turn, row))(K)
 
 
-def times(K: Array, P: Array) -> Array:
-    """K P, (D, D, *batch), (D, *batch) -> (D, *batch)."""
-    return jax.vmap(dot, in_axes=(0, None))(K, P)
-
-
 def impulses(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
     """`contact_law` of C contacts, (C, D, *batch) [N s]; 0 with zero derivative for those not `on` (C, *batch).
 
@@ -91,7 +86,7 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
     Differentiable except at the switches: separating to closing, stick to slip.
     """
     basis, axes = _contact_frame(n), range(n.shape[0])
-    moved = [times(K, e) for e in basis]
+    moved = [matvec(K, e) for e in basis]
     k = [[dot(basis[i], moved[j]) for j in axes] for i in axes]
     v_n, *v_t = [dot(e, v) for e in basis]
     gamma = jnp.maximum(safe_divide(target - v_n, k[0][0]), 0.0)
@@ -148,7 +143,7 @@ def _stopping_impulse(k: list, slip: list) -> list:
 def sticking_impulse(K: Array, n: Array, slip: Array) -> Array:
     """The impulse (D, *batch) [N s] that stops a slip (D, *batch) [m/s] and leaves the normal velocity."""
     basis, axes = _contact_frame(n), range(n.shape[0])
-    k = [[dot(basis[i], times(K, basis[j])) for j in axes] for i in axes]
+    k = [[dot(basis[i], matvec(K, basis[j])) for j in axes] for i in axes]
     P = _stopping_impulse(k, [dot(e, slip) for e in basis[1:]])
     return sum(P[i][None] * basis[i] for i in axes)
 

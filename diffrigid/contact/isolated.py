@@ -24,7 +24,7 @@ from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, sum_of_t
 from diffrigid.contact.strikes import is_rolling, materials, mixed, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
-from diffrigid.numerics import apart, constant, dot, fold, opaque_true, some
+from diffrigid.numerics import any_world, constant, dot, fold, opaque_true, unfused
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
@@ -34,7 +34,7 @@ SHARE = 8  # bodies for each slot of a round
 ROUNDS = 3  # in which the impacts of a pass are taken; most need one, and reverse mode pays for each
 
 
-def is_crowded(world: Any) -> bool:
+def meets_in_rounds(world: Any) -> bool:
     """Whether all bodies are discs, or spheres, whose impact times have a closed form, in many pairs. Static."""
     moving, count = len(world.names), sum(len(pairs.a) for pairs in world.pairs)
     bodies = [(kind, owner) for kind, owners in enumerate(world.owners) for owner in owners if owner < moving]
@@ -103,13 +103,13 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
 
     # Apart: times are compared with each other, and must not be computed twice with another rounding.
     times = [_times(live, world, table, flight, since, dt) for table in tables]
-    first = apart(live, first_of, times)
-    lead, other, crossed = apart(live, in_slots, first, apart(live, with_what, times, first))
+    first = unfused(live, first_of, times)
+    lead, other, crossed = unfused(live, in_slots, first, unfused(live, with_what, times, first))
     before = constant(tuple(tuple(float(i < j) for j in range(moving)) for i in range(moving)), str(dt.dtype))
     rank = sum_of_terms(lax.expand_dims(before, range(2, 1 + lead.ndim)), lead[:, None], 0)[:, 0]
     needed = fold(jnp.add, lead, 0)
     crossed, width = crossed | (needed > ROUNDS * slots_of(moving)), world.contact.width
-    isolated = ~some(crossed if width is None else crossed | (width > 0))
+    isolated = ~any_world(crossed if width is None else crossed | (width > 0))
     return Next(lead, rank, other), isolated, needed
 
 
@@ -124,7 +124,7 @@ def meet_in_rounds(
         return meet(world, tables, fill_slots(tables, count, following, begin, live), anchors, launch, dt)
 
     def one_round(anchors, begin):
-        return lax.cond(some(needed > begin), meet_from, lambda _, anchors: anchors, begin, anchors), None
+        return lax.cond(any_world(needed > begin), meet_from, lambda _, anchors: anchors, begin, anchors), None
 
     begins = constant(tuple(float(count * k) for k in range(ROUNDS)), str(dt.dtype))
     return lax.scan(one_round, anchors, begins)[0]
@@ -160,8 +160,8 @@ def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Ar
 
         return tuple(map(there, tables))
 
-    a = apart(live, weights, following)
-    return Slots(a, apart(live, of_b, *apart(live, sides, a, following), following))
+    a = unfused(live, weights, following)
+    return Slots(a, unfused(live, of_b, *unfused(live, sides, a, following), following))
 
 
 def _times(live: Array, world: Any, table: Table, flight: Flight, since: Array, dt: Array) -> Array:
@@ -169,7 +169,7 @@ def _times(live: Array, world: Any, table: Table, flight: Flight, since: Array, 
     a, b = sides_of_table(world, table, flight, since)
     if table.b[0] < a.flight.t0.shape[0]:
         return _times_of_pairs(world, table, a, since, dt)
-    return apart(live, functools.partial(_times_to_statics, world, table), a, b, dt)
+    return unfused(live, functools.partial(_times_to_statics, world, table), a, b, dt)
 
 
 def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Array) -> Array:
@@ -192,8 +192,8 @@ def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Ar
         return jnp.where(rests, RESTS, s)
 
     live = opaque_true(dt)
-    lines = (*apart(live, at_start, bodies.flight), bodies.flight.t0, since, bodies.shape.radius)
-    return _allowed(table, apart(live, jax.vmap(jax.vmap(one, (None, 0)), (0, None)), lines, lines))
+    lines = (*unfused(live, at_start, bodies.flight), bodies.flight.t0, since, bodies.shape.radius)
+    return _allowed(table, unfused(live, jax.vmap(jax.vmap(one, (None, 0)), (0, None)), lines, lines))
 
 
 def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
@@ -231,7 +231,7 @@ def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> A
         rests = comes_to_rest(u, restitution_at(u, *law) * u, closing, dt - s, world.contact.rest_speed)
         return jnp.where(found, jnp.where(rests & (s <= dt), RESTS, s), jnp.inf)
 
-    n, offset, law = apart(live, planes, b, own, others)
+    n, offset, law = unfused(live, planes, b, own, others)
     bodies = (f.x, f.v, f.a, f.t0, a.since, a.shape.radius)
     return jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, 0))(bodies, (n, offset), law)
 

@@ -19,7 +19,7 @@ from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import same_bodies
 from diffrigid.contact.slipping import least_slip, rubbing, slips
-from diffrigid.numerics import dot, norm, normalise, safe_divide, some, sum_rows
+from diffrigid.numerics import any_world, dot, norm, normalise, safe_divide, sum_rows
 from diffrigid.pytree import array, pytree, replace
 
 
@@ -28,10 +28,12 @@ class Known:
     """Impulses that are known, on body a of each contact and row; else 0."""
 
     P: Array = array("C", "D")  # [N s]; where gaps are closed [kg m]
-    early: Array = array("C", "D")  # [N s^2] what they move bodies by beside an even force: not 0 where friction turns
+    early: Array = array(
+        "C", "D"
+    )  # [N s^2] what they move bodies by beside an even force: not 0 where friction reverses
 
-    def turns(self) -> Array:
-        """Whether some friction turns in a world, (*batch) bool."""
+    def reverses(self) -> Array:
+        """Whether some friction reverses in a world, (*batch) bool."""
         return (self.early != 0).any((0, 1))
 
     def opened(self, gap: Array) -> Array:
@@ -49,7 +51,7 @@ def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tupl
     return strikes, Law(target, jnp.where(rubs, 0.0, mu), most)
 
 
-def turning_back(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array) -> Known:
+def reversing(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array) -> Known:
     """Friction where a slip stops and goes back within T, from impulses P that take it to act one way.
 
     Until the stop, at a share of T, it acts one way with all of its bound, from then on the other, evenly: the sum is
@@ -79,7 +81,7 @@ def turning_back(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: 
         del changes, law
         return Known(P=jnp.zeros_like(P), early=jnp.zeros_like(P))
 
-    return lax.cond(some(held), found, nothing, P, changes, law)
+    return lax.cond(any_world(held), found, nothing, P, changes, law)
 
 
 def loads(strikes: Strikes, P: Array, most: Array | None, T: Array) -> Array:

@@ -14,7 +14,7 @@ from jax import Array
 
 from diffrigid.collide import Contacts
 from diffrigid.contact.sides import Placed, Side, contacts_of
-from diffrigid.numerics import apart, dot, safe_divide
+from diffrigid.numerics import dot, safe_divide, unfused
 from diffrigid.pytree import array, pytree
 from diffrigid.state import rotations
 
@@ -65,11 +65,11 @@ def levers(
 
 
 def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tuple[Contacts, Contacts]:
-    """The contacts of a pair, and their rates: how the surfaces move where they meet. For `live` see `apart`."""
+    """The contacts of a pair, and their rates: how the surfaces move where they meet. For `live` see `unfused`."""
     so = rotations(at_a.x.shape[0])
     poses = [(at.x, at.q) for at in (at_a, at_b)]
     rates = [
-        tuple(map(jnp.zeros_like, pose)) if at.v is None else (at.v, apart(live, so.rate, at.w, at.q))
+        tuple(map(jnp.zeros_like, pose)) if at.v is None else (at.v, unfused(live, so.rate, at.w, at.q))
         for at, pose in zip((at_a, at_b), poses, strict=True)
     ]
 
@@ -80,7 +80,7 @@ def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tup
 
         return jax.jvp(placed, tuple(poses), tuple(rates))
 
-    return apart(live, moved, a, b, poses, rates)
+    return unfused(live, moved, a, b, poses, rates)
 
 
 def acceleration(side: Side, at: Placed, s: Array, arm: Array, rate: Array | None) -> Array | None:

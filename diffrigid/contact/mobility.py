@@ -10,7 +10,7 @@ from jax import Array
 from diffrigid.contact.cone import put
 from diffrigid.contact.sides import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
 from diffrigid.linkage import Linkage, spread
-from diffrigid.numerics import dot, identity, sum_rows, times, unit_vector
+from diffrigid.numerics import dot, identity, matvec, sum_rows, unit_vector
 from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import rotations
 
@@ -105,7 +105,7 @@ def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, 
     apply = rotations(dp.shape[1]).apply
     if mobility.matrix is None:
         return mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL), dL
-    twist = times(mobility.matrix, jnp.concatenate([dp, dL], axis=1).reshape(-1, *dp.shape[2:]))
+    twist = matvec(mobility.matrix, jnp.concatenate([dp, dL], axis=1).reshape(-1, *dp.shape[2:]))
     dv, dw = jnp.split(twist.reshape(len(dp), -1, *dp.shape[2:]), [dp.shape[1]], axis=1)
     return dv, dw, jax.vmap(apply)(mobility.inertia, dw)
 

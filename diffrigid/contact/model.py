@@ -3,7 +3,7 @@
     IMPACT, as often as `sweeps`   the next impact of every body, at its true time, with restitution; before it what
                                    rests is held until then (`order.py`)
     HOLD                           what rests, at the end of the step: the velocities must not close
-    TURN                           instead of HOLD where a slip turns back within the step (`known.py`)
+    REVERSE                        instead of HOLD where a slip stops and reverses within the step (`known.py`)
     PUSH                           what rests: gaps that rounding or turning left are closed; momenta are kept,
                                    energy to the order of the gap
 
@@ -25,7 +25,7 @@ from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.apply import apply_impulses
 from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import comes_to_rest, restitution_at
-from diffrigid.contact.isolated import is_crowded, meet_in_rounds, next_impacts, tables_of
+from diffrigid.contact.isolated import meets_in_rounds, meet_in_rounds, next_impacts, tables_of
 from diffrigid.contact.known import Known
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders
@@ -42,11 +42,11 @@ from diffrigid.contact.strikes import (
     waits,
 )
 from diffrigid.flight import Flight, state_at
-from diffrigid.numerics import FOUND, constant, dot, safe_divide, some, with_tangents
+from diffrigid.numerics import FOUND, any_world, constant, dot, safe_divide, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
 
-IMPACT, HOLD, TURN, PUSH = 0, 1, 2, 3
+IMPACT, HOLD, REVERSE, PUSH = 0, 1, 2, 3
 HOLDS = 2  # passes until the first impact of what rests: one to where it would be in free fall, one from there
 
 
@@ -91,8 +91,8 @@ class Contact:
         if not ends(world)["a"]:
             return state_at(launch(state, t0), dt)
         start = with_tangents(Anchors(state=state, t0=t0, since=t0 - dt[None]), (world, dt))
-        # In a crowd some pair is always near, and times are found fast.
-        near = jnp.asarray(True) if is_crowded(world) else may_meet(world, launch(state, t0), dt)
+        # Among so many pairs some is always near, and times are found fast.
+        near = jnp.asarray(True) if meets_in_rounds(world) else may_meet(world, launch(state, t0), dt)
         end = self._passes(world, start, launch, dt, near)
         return state_at(launch(end.state, end.t0), dt)
 
@@ -106,7 +106,7 @@ class Contact:
         def one_pass(now, phase):
             return _pass(world, now, launch, dt, phase)
 
-        tables = tables_of(world) if is_crowded(world) else ()
+        tables = tables_of(world) if meets_in_rounds(world) else ()
 
         def isolated_or_any(now, phase):
             flight = lax.stop_gradient(launch(now.anchors.state, now.anchors.t0))
@@ -114,20 +114,20 @@ class Contact:
 
             def isolated_pass():
                 after = meet_in_rounds(world, tables, following, needed, now.anchors, launch, dt)
-                return now._replace(anchors=after, found=some(needed > 0))
+                return now._replace(anchors=after, found=any_world(needed > 0))
 
             return lax.cond(isolated & (phase == IMPACT), isolated_pass, lambda: one_pass(now, phase))
 
         def maybe(now, phase):
             needed = jnp.where(phase == IMPACT, now.found, now.rests)
             if now.known is not None:
-                needed = jnp.where(phase == TURN, some(now.known.turns()), needed)
+                needed = jnp.where(phase == REVERSE, any_world(now.known.reverses()), needed)
             some_pass = isolated_or_any if tables else one_pass
             return lax.cond(needed, lambda now: some_pass(now, phase), lambda now: now, now), None
 
         impacts = self.sweeps + HOLDS * waits(world)
         loaded, rows = is_loaded(world), len(always) + is_rolling(world) * contact_count(world)
-        phases = jnp.array([IMPACT] * impacts + [HOLD] + [TURN] * loaded + [PUSH])
+        phases = jnp.array([IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH])
         nothing = jnp.zeros((rows, *start.state.x.shape[1:]), start.t0.dtype)
         known = with_tangents(Known(P=nothing, early=nothing), (world, dt)) if loaded else None
         first = Progress(start, resting, known, near, jnp.asarray(any(always)))
@@ -145,12 +145,12 @@ class Progress(NamedTuple):
 
 
 def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
-    (anchors, resting, known, *_), (impact, turn, push) = now, (phase == kind for kind in (IMPACT, TURN, PUSH))
+    (anchors, resting, known, *_), (impact, reverse, push) = now, (phase == kind for kind in (IMPACT, REVERSE, PUSH))
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
     strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
     if known is not None:
-        skips = turn & ~known.turns()
+        skips = reverse & ~known.reverses()
         unused = skips | (push & ~known.opened(strikes.gap))
         strikes = replace(strikes, active=strikes.active & ~skips[None])
 
@@ -160,15 +160,15 @@ def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) 
         if known is None:
             return applied(None)[0], None
         nothing = jax.tree.map(jnp.zeros_like, known)
-        after, turns, load = applied(_choice(unused, nothing, known))
-        turns = _choice(phase == HOLD, turns, nothing)
-        waits, load = turns.turns(), jnp.where(impact | push, 0.0, load)
-        following = replace(turns, P=jnp.where(waits, turns.P, load))
-        return _choice(waits, anchors, after), _choice(skips, known, following)
+        after, friction, load = applied(_choice(unused, nothing, known))
+        friction = _choice(phase == HOLD, friction, nothing)
+        reverses, load = friction.reverses(), jnp.where(impact | push, 0.0, load)
+        following = replace(friction, P=jnp.where(reverses, friction.P, load))
+        return _choice(reverses, anchors, after), _choice(skips, known, following)
 
-    any_now = some(strikes.active)
+    any_now = any_world(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
-    return Progress(anchors, resting, known, any_now, some(resting | strikes.rests))
+    return Progress(anchors, resting, known, any_now, any_world(resting | strikes.rests))
 
 
 def _demanded(
@@ -215,7 +215,7 @@ def _held(
     slow = -jax.vmap(dot)(strikes.normal, strikes.v_rel) <= world.contact.rest_speed[None]
     comes = strikes.active & ~strikes.held & (slow | (strikes.now & stays))
     held = jnp.where(phase == PUSH, resting & ~drives, held)
-    return held, jnp.where(impact, resting | held | comes, jnp.where(phase == TURN, resting, held))
+    return held, jnp.where(impact, resting | held | comes, jnp.where(phase == REVERSE, resting, held))
 
 
 def _fallen(world: Any, flight: Flight, closing: Array, dt: Array) -> Array:

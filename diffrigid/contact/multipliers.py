@@ -22,7 +22,7 @@ from jax import Array, lax
 
 from diffrigid.contact.cone import Cone, nearest, put, split
 from diffrigid.contact.mobility import Mobility, at_contacts, bodies_matrix, twists
-from diffrigid.numerics import norm, solve_regular, some
+from diffrigid.numerics import any_world, norm, solve_regular
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most
@@ -72,7 +72,7 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
     u, least = twists(nothing, arms, mobility), jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
 
     def busy(carry):
-        return (carry[0] < ROUNDS) & some(carry[-1] > enough)
+        return (carry[0] < ROUNDS) & any_world(carry[-1] > enough)
 
     return lax.while_loop(busy, again, (0, u, nothing, nothing, least))[3]
 
@@ -90,7 +90,7 @@ def _down(slope: Callable, whole: Array) -> Array:
         return lax.fori_loop(0, HALVINGS, halved, (jnp.zeros_like(whole), whole))[1]
 
     over = slope(whole) > 0
-    return jnp.where(over, lax.cond(some(over), search, lambda: whole), whole)
+    return jnp.where(over, lax.cond(any_world(over), search, lambda: whole), whole)
 
 
 def _momenta(u: Array, mobility: Mobility, D: int) -> Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.contact.sides import at_colliders, body_sides
-from diffrigid.numerics import rows, some
+from diffrigid.numerics import any_world, rows
 from diffrigid.pytree import array, pytree, replace
 
 SOON = 1e-4  # [-] of a step: what is held no longer than this need not be
@@ -82,7 +82,7 @@ def in_order(
         def free(first: Array, _: Array) -> tuple[Array, Array]:
             return (jnp.full_like(first, jnp.inf),) * 2
 
-        of_both = lax.cond(some(rests) & some(fast), of_clusters, free, first, first_of(fast & bounces))
+        of_both = lax.cond(any_world(rests) & any_world(fast), of_clusters, free, first, first_of(fast & bounces))
         until, along = (links.least(of_bodies, jnp.inf) for of_bodies in of_both)
         waits, joins = until < jnp.inf, (rests | now) & ~bounces & (along < jnp.inf)
         now, held = (now & ~waits) | joins, held | (waits & rests)
@@ -111,7 +111,7 @@ def hanging_together(on: Array, links: Links) -> Array:
         label, _ = carry
         least = jnp.where(on, links.least(label, moving), moving)
         least = jnp.minimum(label, links.of_bodies(jnp.min, least, moving))
-        return least, some(least < label)
+        return least, any_world(least < label)
 
     return lax.while_loop(lambda carry: carry[1], spread, (number, jnp.asarray(True)))[0]
 

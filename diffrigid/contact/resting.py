@@ -10,7 +10,7 @@ from diffrigid.contact.gain import solve_without_gain
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sides import at_colliders
-from diffrigid.numerics import safe_sqrt, some
+from diffrigid.numerics import any_world, safe_sqrt
 from diffrigid.pytree import array, pytree, static
 
 
@@ -50,27 +50,29 @@ class Law(NamedTuple):
     most: Array | None  # [N s] of the normal impulse, to both sides; infinite: it pushes, without bound. None: all do
 
 
-def solve_impulses(strikes: Strikes, law: Law, mobility: Mobility, crowd: Array, rest_speed: Array) -> Array:
+def solve_impulses(strikes: Strikes, law: Law, mobility: Mobility, count: Array, rest_speed: Array) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
     A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `together.py`,
     which is not even compiled for a world where all are always alone, as one disc over a floor.
 
     Args:
-        crowd: (N, *batch) number of active contacts of each body.
+        count: (N, *batch) number of active contacts of each body.
         rest_speed: (*batch) [m/s] what is slow in these worlds.
     """
     target, mu, most = law
-    if mobility.matrix is None and are_alone(strikes.a, strikes.b, len(crowd)):
+    if mobility.matrix is None and are_alone(strikes.a, strikes.b, len(count)):
         return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu)
-    others = jnp.maximum(at_colliders(crowd, strikes.a, 1.0), at_colliders(crowd, strikes.b, 1.0))
+    others = jnp.maximum(at_colliders(count, strikes.a, 1.0), at_colliders(count, strikes.b, 1.0))
     others = lax.stop_gradient(others)
     shared = strikes.active & ((others > 1) | (mobility.matrix is not None))
     by_itself = strikes.active & ~shared
-    alone = lax.cond(some(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu)
+    alone = lax.cond(
+        any_world(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu
+    )
     scale = lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
     cone = Cone(
-        on=shared.astype(others.dtype), crowd=jnp.maximum(others, 1.0), scale=scale, normal=strikes.normal,
+        on=shared.astype(others.dtype), sharing=jnp.maximum(others, 1.0), scale=scale, normal=strikes.normal,
         target=target, mu=mu, most=most, spin=strikes.spin, rest_speed=rest_speed,
     )  # fmt: skip
     arms = Arms(

@@ -24,6 +24,7 @@ from diffrigid.contact.sides import (
 from diffrigid.numerics import (
     FOUND,
     MANY,
+    any_world,
     dot,
     fold,
     norm,
@@ -31,7 +32,6 @@ from diffrigid.numerics import (
     safe_divide,
     safe_sqrt,
     softplus,
-    some,
 )
 from diffrigid.shapes import HalfSpace, HeightField, radius, vertices
 from diffrigid.state import rotations
@@ -67,7 +67,7 @@ def approach_search(
 
 def if_smooth(width: Array | None, smooth, exact, *args: Array) -> Array:
     """smooth(*args) if any width is positive, else exact(*args)."""
-    return exact(*args) if width is None else lax.cond(some(width > 0), smooth, exact, *args)
+    return exact(*args) if width is None else lax.cond(any_world(width > 0), smooth, exact, *args)
 
 
 def touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array:
@@ -156,7 +156,7 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array
 
     def busy(carry):
         count, s, dt, _ = carry
-        return ~at_end & ((count == 0) | ((count < most) & some((dt > 0) & (s < t1))))
+        return ~at_end & ((count == 0) | ((count < most) & any_world((dt > 0) & (s < t1))))
 
     def advance(carry):
         count, s, dt, rests = carry
@@ -210,7 +210,7 @@ def _polish(
 
     def busy(carry):
         count, _, dt, *_ = carry
-        return ~at_end & (count <= POLISH) & some(jnp.abs(dt) > slack * span)
+        return ~at_end & (count <= POLISH) & any_world(jnp.abs(dt) > slack * span)
 
     def towards(carry):
         count, s, _, _, inside = carry

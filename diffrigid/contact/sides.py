@@ -13,7 +13,7 @@ from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.distance import reach
 from diffrigid.collide.heights import candidates
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
-from diffrigid.numerics import apart, dot, fold, norm, rows, sum_rows
+from diffrigid.numerics import dot, fold, norm, rows, sum_rows, unfused
 from diffrigid.pytree import array, pytree
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
@@ -68,13 +68,13 @@ def side_of(world: Any, flight: Flight, since: Array, kind: int, shape_rows: tup
 
 @jax.jit
 def place(side: Side, s: Array, live: Array) -> Placed:
-    """The collider at time s (*batch) [s]; for `live` see `apart`."""
+    """The collider at time s (*batch) [s]; for `live` see `unfused`."""
     f = side.flight
     if f is None:
         return Placed(x=side.x, q=side.q)
     so = rotations(f.dim)
-    q = apart(live, orientation, f, s)
-    inverse = apart(live, so.world_inverse, f.inverse_inertia, q)
+    q = unfused(live, orientation, f, s)
+    inverse = unfused(live, so.world_inverse, f.inverse_inertia, q)
     L = angular_momentum(f, s)
     w = so.apply(inverse, L)
     # A torque that varies is left out: its curve may be steep where little is left of the step.

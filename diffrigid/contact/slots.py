@@ -19,7 +19,7 @@ from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
 from diffrigid.contact.strikes import law, materials, next_strikes
 from diffrigid.flight import Flight, orientation
-from diffrigid.numerics import apart, dot, fold, opaque_true, pack
+from diffrigid.numerics import dot, fold, opaque_true, pack, unfused
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 
@@ -86,19 +86,19 @@ def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, 
     blows = []
     for table, there in zip(tables, slots.b, strict=True):
         if table.b[0] < moving:
-            blows.append(apart(live, functools.partial(blow, unpack), columns_a, columns_b, there))
+            blows.append(unfused(live, functools.partial(blow, unpack), columns_a, columns_b, there))
         else:
             static, unpack_static = pack(_static(world, table, flight, anchors.since), dt.ndim)
             static = _pick(live, there, static)
-            blows.append(apart(live, functools.partial(blow, unpack_static), columns_a, static, there))
-    on, t, P, arm_a, arm_b = apart(live, impulse, blows)
+            blows.append(unfused(live, functools.partial(blow, unpack_static), columns_a, static, there))
+    on, t, P, arm_a, arm_b = unfused(live, impulse, blows)
     if movers:
         on, t, P, arm = (jnp.concatenate(pair) for pair in ((on, on), (t, t), (P, -P), (arm_a, arm_b)))
     else:
         arm = arm_a
-    after, unpack_after = pack(apart(live, end, columns, t, P, arm), dt.ndim)
-    weights = apart(live, lambda weights, on: weights * on[:, None], weights, on)
-    state, t = unpack_after(apart(live, put, weights, after))
+    after, unpack_after = pack(unfused(live, end, columns, t, P, arm), dt.ndim)
+    weights = unfused(live, lambda weights, on: weights * on[:, None], weights, on)
+    state, t = unpack_after(unfused(live, put, weights, after))
     hit = fold(jnp.add, weights, 0) > 0
     old = (anchors.state, anchors.t0, anchors.since)
     state, t0, since = jax.tree.map(functools.partial(_where, hit), (state, t, t), old)
@@ -135,8 +135,8 @@ def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
     def pick(weights, columns):
         return [_weighted_sum(weights, column, 1) for column in columns]
 
-    weights = apart(live, filled, weights, apart(live, summed, weights))
-    return apart(live, pick, weights, columns)
+    weights = unfused(live, filled, weights, unfused(live, summed, weights))
+    return unfused(live, pick, weights, columns)
 
 
 def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:

@@ -21,7 +21,7 @@ from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, 
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
 from diffrigid.linkage import islands
-from diffrigid.numerics import apart, constant, dot, norm, opaque_true, rows, some
+from diffrigid.numerics import any_world, constant, dot, norm, opaque_true, rows, unfused
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
@@ -45,7 +45,7 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     parts, jac = [], None
     for sides, meeting in zip(groups, meetings, strict=False):
         each = jax.vmap(lambda a, b, meeting: strikes_of(a, b, meeting, dt, is_loaded(world)))
-        part = apart(opaque_true(dt), each, *sides, meeting)
+        part = unfused(opaque_true(dt), each, *sides, meeting)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1])
@@ -156,7 +156,7 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
     since = jnp.zeros_like(flight.t0)
     if stops_of(world):
         return jnp.asarray(True)
-    near = [some(jax.vmap(one)(*sides_of(world, pairs, flight, since))) for pairs in world.pairs]
+    near = [any_world(jax.vmap(one)(*sides_of(world, pairs, flight, since))) for pairs in world.pairs]
     return functools.reduce(jnp.logical_or, near)
 
 

@@ -31,7 +31,7 @@ from jax.ad_checkpoint import checkpoint_name
 from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
-from diffrigid.numerics import FOUND, dot, identity, norm, safe_divide, solve_regular, some, times
+from diffrigid.numerics import FOUND, any_world, dot, identity, norm, safe_divide, solve_regular
 from diffrigid.pytree import array, pytree, replace
 
 ROUNDS = 40  # at most, of Newton's method
@@ -49,7 +49,7 @@ class Slope:
 
     on: Array = array("C")  # 1 where the contact pushes, else 0
     slides: Array = array("C")  # 1 where it does at its bound of friction
-    turn: Array = array("C")  # [-] how far the direction of sliding follows z; 1 where it sticks
+    bends: Array = array("C")  # [-] how far the direction of sliding follows z; 1 where it sticks
     normal: Array = array("C", "D")
     along: Array = array("C", "D")  # of the sliding
     mu: Array = array("C")
@@ -70,8 +70,8 @@ def _slope(cone: Cone, z: Array) -> Slope:
         bound = loaded(cone, jnp.maximum(z_n, 0.0), z_n, bound)[1]
     follows = z_n > 0 if cone.most is None else jnp.where(jnp.isinf(cone.most), z_n > 0, jnp.abs(z_n) < cone.most)
     on, slides = jnp.where(follows, cone.on, 0.0), (size >= bound).astype(z.dtype)
-    turn, along = jnp.where(size < bound, 1.0, safe_divide(bound, size)), z_t / jnp.where(size > 0, size, 1.0)[:, None]
-    slope = Slope(on=on, slides=slides, turn=turn, normal=cone.normal, along=along, mu=cone.mu)
+    bends, along = jnp.where(size < bound, 1.0, safe_divide(bound, size)), z_t / jnp.where(size > 0, size, 1.0)[:, None]
+    slope = Slope(on=on, slides=slides, bends=bends, normal=cone.normal, along=along, mu=cone.mu)
     if cone.spin is None:
         return slope
     load, about = jnp.maximum(z_n[: len(cone.spin)], 0.0), turning(cone.spin, z_n)
@@ -87,8 +87,8 @@ def _sloped(slope: Slope, r: Array) -> Array:
     if slope.spin is not None:
         load = put(slope.spin, r_n, (slope.on * r_n)[: len(slope.spin)])
         r_n = put(slope.spin, r_n, slope.free * turning(slope.spin, r_n) + slope.spin * turning(slope.spin, load))
-    along = slope.slides * (slope.mu * load - slope.turn * jax.vmap(dot)(slope.along, r_t))
-    return slope.on[:, None] * (r_n[:, None] * slope.normal + slope.turn[:, None] * r_t + along[:, None] * slope.along)
+    along = slope.slides * (slope.mu * load - slope.bends * jax.vmap(dot)(slope.along, r_t))
+    return slope.on[:, None] * (r_n[:, None] * slope.normal + slope.bends[:, None] * r_t + along[:, None] * slope.along)
 
 
 def _unsloped(slope: Slope, e: float, r: Array) -> tuple[Array, Array]:
@@ -97,13 +97,13 @@ def _unsloped(slope: Slope, e: float, r: Array) -> tuple[Array, Array]:
     r_along = slope.slides * jax.vmap(dot)(slope.along, r_t)
     r_across = r_t - r_along[:, None] * slope.along
     on, kept = slope.on, 1.0 - slope.on * (1.0 - e)
-    rest = 1.0 - on * (1.0 - e) * slope.turn  # e where it sticks
+    rest = 1.0 - on * (1.0 - e) * slope.bends  # e where it sticks
     if slope.spin is not None:
         kept = put(slope.spin, kept, 1.0 - turning(slope.spin, on) * slope.free * (1.0 - e))
         return _unsloped_rows(slope, e, r_n / kept, r_along, r_across, rest)
     drag = slope.slides * slope.mu * r_n / kept * on
     B_r = (r_n / kept)[:, None] * slope.normal + r_across / rest[:, None]
-    BD_r = (on * r_n / kept)[:, None] * slope.normal + (on * slope.turn / rest)[:, None] * r_across
+    BD_r = (on * r_n / kept)[:, None] * slope.normal + (on * slope.bends / rest)[:, None] * r_across
     return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
 
 
@@ -119,7 +119,7 @@ def _unsloped_rows(slope: Slope, e: float, x_n: Array, r_along: Array, r_across:
     own = put(slope.spin, on, turning(slope.spin, on) * slope.free) * x_n
     drag = on * slope.slides * slope.mu * load
     B_r = (x_n + (1.0 - e) * more)[:, None] * slope.normal + r_across / rest[:, None]
-    BD_r = (own + more)[:, None] * slope.normal + (on * slope.turn / rest)[:, None] * r_across
+    BD_r = (own + more)[:, None] * slope.normal + (on * slope.bends / rest)[:, None] * r_across
     return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
 
 
@@ -172,7 +172,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
         error = _speed(cone, r)
         start = Search(0, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
         again = functools.partial(_again, given=(cone, v_rel, arms, mobility))
-        return lax.while_loop(lambda now: (now.count < ROUNDS) & some(_lacks(cone, now)), again, start).best
+        return lax.while_loop(lambda now: (now.count < ROUNDS) & any_world(_lacks(cone, now)), again, start).best
 
     return lax.cond(shared, solved, lambda nothing: nothing, jnp.zeros_like(v_rel))
 
@@ -195,9 +195,9 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
         return P, *_missing(P, *given)
 
     poor = _lacks(cone, now) & (_speed(cone, r) > 0.5 * now.error)
-    P, z, r = lax.cond(some(poor), smoothed, lambda *kept: kept, P, z, r)
+    P, z, r = lax.cond(any_world(poor), smoothed, lambda *kept: kept, P, z, r)
     if mobility.inverse_mass.shape[0] >= PILE:
-        circles = (now.count > 0) & (now.count % CIRCLES == 0) & some(_circles(cone, now))
+        circles = (now.count > 0) & (now.count % CIRCLES == 0) & any_world(_circles(cone, now))
         P, z, r, since = lax.cond(
             circles, functools.partial(_elsewhere, now, given), lambda *kept: kept, P, z, r, since
         )
@@ -229,7 +229,7 @@ def _missing(P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility)
 def _smoothed(rounds: int, P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
     def smoother(_, P):
         z = _excess(cone, P, v_rel, arms, mobility)
-        return allowed(cone, P + (z - P) / cone.crowd[:, None])
+        return allowed(cone, P + (z - P) / cone.sharing[:, None])
 
     return lax.fori_loop(0, rounds, smoother, P)
 
@@ -279,7 +279,7 @@ def _solve_together_jvp(primals, tangents):
         inverse = solve_regular(matrix, identity(matrix))
 
         def step(r):
-            return _newton_step(r, functools.partial(times, inverse), *fixed)
+            return _newton_step(r, functools.partial(matvec, inverse), *fixed)
 
         approximate = (lambda r: jax.linear_transpose(step, b)(r)[0]) if transposed else step
         return lax.fori_loop(0, REFINEMENTS, lambda _, x: x + approximate(b - matvec(x)), jnp.zeros_like(b))
