@@ -12,6 +12,7 @@ from diffrigid import view as view
 from diffrigid.batch import rollout_batch
 from diffrigid.contact import Contact
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
+from diffrigid.impacts import contacts
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.models import load_mjcf, load_urdf
 from diffrigid.pytree import replace
@@ -95,6 +96,7 @@ __all__ = [
     "angular_momentum",
     "bootstrap",
     "check",
+    "contacts",
     "direction",
     "each",
     "explore",

@@ -64,11 +64,23 @@ class Motion(NamedTuple):
     w: np.ndarray  # (T+1, N + S, A)
 
 
-def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> Meetings:
-    """Impacts, and contacts at rest.
+def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meetings:
+    """When, where and with what impulses bodies of a trajectory touch: `t`, `impact` (or rest), colliders `a` and `b`,
+    `point` and `impulse`, in order of time. NumPy, without derivatives.
+
+    A trajectory stores states, and not impulses: these are the least that explain its changes of momentum. Contacts
+    with a `Profile` or a `HeightField` are not found.
 
     Args:
-        t_drawn: (F,) [s] times that are drawn; resting contacts are given only for intervals that begin then.
+        times: (F,) [s] resting contacts are given only for intervals that begin then; default all.
+
+    Example:
+        >>> bounce = dr.contacts(trajectory)
+        >>> names = trajectory.world.names + trajectory.world.static_names
+        >>> [(round(t, 2), names[a], names[b]) for t, a, b in zip(bounce.t, bounce.a, bounce.b)]
+        [(0.43, 'ball', 'floor')]
+        >>> bounce.impulse.round(2).tolist()  # m (1 + e) u
+        [[0.0, 7.56]]
     """
     world, dim = trajectory.world, trajectory.world.dim
     some = _thinned(trajectory)
@@ -85,7 +97,9 @@ def find_contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> Meetings:
     moved = np.concatenate([push, np.zeros((len(push), len(world.static_names)))], axis=1)
     rough = size > ROUGH * moved[touch.interval[:, None], ends].max(1)
     impact = touch.new | rough
-    drawn = np.isin(touch.interval, np.searchsorted(motion.t, t_drawn - 1e-9 * motion.t[-1]))
+    drawn = np.ones(len(touch.s), bool)
+    if times is not None:
+        drawn = np.isin(touch.interval, np.searchsorted(motion.t, times - 1e-9 * motion.t[-1]))
     kept = (size > 1e-6 * size.max()) & (impact | drawn)
     t = motion.t[touch.interval] + touch.s
     kept = np.flatnonzero(kept)[np.argsort(t[kept], kind="stable")]
@@ -98,7 +112,7 @@ def order_of_impacts(trajectory: Trajectory) -> tuple[str, ...]:
     Several points of one pair at a time are one impact. Those of different pairs that are closer in time than a
     hundredth of a step count as simultaneous, and are listed by name, so that rounding does not tell them apart.
     """
-    found, names = find_contacts(trajectory, np.zeros(0)), trajectory.world.names + trajectory.world.static_names
+    found, names = contacts(trajectory, np.zeros(0)), trajectory.world.names + trajectory.world.static_names
     near = 0.01 * float(np.median(np.diff(trajectory.t)))
     whole = np.cumsum(np.diff(found.t[found.impact], prepend=0.0) > near)  # times that are near share a number
     pairs = [f"{names[a]}-{names[b]}" for a, b in zip(found.a[found.impact], found.b[found.impact], strict=True)]

@@ -17,6 +17,7 @@ from diffrigid.convert import Numbers, largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import opaque_true, with_tangents
+from diffrigid.paths import read
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.shapes import traced
 from diffrigid.state import State
@@ -32,12 +33,18 @@ class Trajectory:
     Example:
         >>> trajectory.t.shape, trajectory.state.x.shape  # the start and 30 steps
         ((31,), (31, 1, 2))
+        >>> trajectory["ball.x"].shape, trajectory["ball.v[1]"].shape  # by path, as `dr.paths` and `fit` name them
+        ((31, 2), (31,))
     """
 
     t: Array = array("T")  # (T+1,) [s], from 0, or the given times
     state: State
     world: World
     controls: Any = None  # as given, over each interval
+
+    def __getitem__(self, path: str) -> Array:
+        """What a path names, at every time, (T+1, ...); see `diffrigid.paths`."""
+        return jax.vmap(lambda state: read(self.world, state, path))(self.state)
 
     def _repr_html_(self) -> str | None:
         """The motion itself, in a notebook; a batch is shown as text."""

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.collide import COLLIDERS
-from diffrigid.impacts import find_contacts
+from diffrigid.impacts import contacts
 from diffrigid.overlap import place, separation
 from diffrigid.scene_file import read_scene
 from diffrigid.shapes import with_topology
@@ -300,5 +300,5 @@ def test_it_is_read_from_a_file_and_drawn(tmp_path):
     trajectory = dr.Trajectory(
         t=jnp.arange(2.0), state=jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), scene.state), world=scene.world
     )
-    assert not len(find_contacts(trajectory, np.arange(2.0)).t)
+    assert not len(contacts(trajectory, np.arange(2.0)).t)
     assert "height" not in dr.play(trajectory).page[:100]

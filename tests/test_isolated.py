@@ -45,7 +45,7 @@ def heights(world, states, memory=MEMORY):
 
 def test_the_fast_way_is_the_general_way(worlds, monkeypatch):
     """States, and reverse mode of one against forward mode of the other, along one direction for all leaves."""
-    assert isolated.is_crowded(worlds[0])
+    assert isolated.goes_in_rounds(worlds[0])
     (_, end), grad = jax.value_and_grad(heights, argnums=(0, 1), has_aux=True)(*worlds)
     along = jax.tree.map(lambda leaf: jnp.cos(jnp.arange(1.0, 1.0 + leaf.size)).reshape(leaf.shape), worlds)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grad))
@@ -71,7 +71,7 @@ def test_spheres_go_the_fast_way_as_well(monkeypatch):
         for k, x in enumerate(places)
     }  # fmt: skip
     world, state = dr.scene(bodies | {f"wall{k}": wall for k, wall in enumerate(walls)}, restitution=0.9, friction=0.3)
-    assert isolated.is_crowded(world)
+    assert isolated.goes_in_rounds(world)
     end = dr.rollout(world, state, dt=1 / 60, steps=2 * STEPS).state
     monkeypatch.setattr(isolated, "CROWDED", np.inf)
     expected = dr.rollout(world, state, dt=1 / 60, steps=2 * STEPS, memory=OTHER).state
@@ -105,6 +105,6 @@ def test_more_discs_than_sweeps_strike_one_floor_in_a_step():
     for k, (n, offset) in enumerate([((0.0, 1.0), 0.0), ((1.0, 0.0), -1.0), ((-1.0, 0.0), -9.0), ((0.0, -1.0), -9.0)]):
         bodies[f"wall{k}"] = dr.Static(dr.HalfSpace(normal=n, offset=offset))
     world, state = dr.scene(bodies, restitution=0.5)
-    assert isolated.is_crowded(world) and world.contact.sweeps < 6
+    assert isolated.goes_in_rounds(world) and world.contact.sweeps < 6
     end = dr.rollout(world, state, dt=dt, steps=1).state
     assert_allclose(end.x[-1, :, 1] - 0.1, 0.5 * (speed * dt - gap), rtol=1e-12)

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid import sysid
-from diffrigid.impacts import find_contacts
+from diffrigid.impacts import contacts
 
 MASS, SPEED = 1.7, 0.3
 CHANGES = np.array([0.0, 0.11, 0.37, 0.52, 0.8])  # [s] and the pushes from then on
@@ -81,7 +81,7 @@ def test_what_pushes_is_not_taken_for_contact():
     world, state = dr.scene({"ball": ball, "floor": floor}, gravity=(0.0, -9.81), forces=[press])
     down = jnp.stack([jnp.zeros(6), jnp.array([0.0, 3.0, 8.0, 0.0, -5.0, 1.0])], 1)
     motion = dr.rollout(world, state, dt=0.1, steps=6, controls={"press": -down})
-    found = find_contacts(motion, np.asarray(motion.t))
+    found = contacts(motion, np.asarray(motion.t))
     assert_allclose(found.impulse[:, 1], 0.1 * (9.81 * MASS + down[:, 1]), rtol=1e-8)
     assert not found.impact.any()
 

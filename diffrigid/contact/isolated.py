@@ -34,7 +34,7 @@ SHARE = 8  # bodies for each slot of a round
 ROUNDS = 3  # in which the impacts of a pass are taken; most need one, and reverse mode pays for each
 
 
-def meets_in_rounds(world: Any) -> bool:
+def goes_in_rounds(world: Any) -> bool:
     """Whether all bodies are discs, or spheres, whose impact times have a closed form, in many pairs. Static."""
     moving, count = len(world.names), sum(len(pairs.a) for pairs in world.pairs)
     bodies = [(kind, owner) for kind, owners in enumerate(world.owners) for owner in owners if owner < moving]

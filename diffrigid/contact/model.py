@@ -25,7 +25,7 @@ from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.apply import apply_impulses
 from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import comes_to_rest, restitution_at
-from diffrigid.contact.isolated import meets_in_rounds, meet_in_rounds, next_impacts, tables_of
+from diffrigid.contact.isolated import goes_in_rounds, meet_in_rounds, next_impacts, tables_of
 from diffrigid.contact.known import Known
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders
@@ -92,7 +92,7 @@ class Contact:
             return state_at(launch(state, t0), dt)
         start = with_tangents(Anchors(state=state, t0=t0, since=t0 - dt[None]), (world, dt))
         # Among so many pairs some is always near, and times are found fast.
-        near = jnp.asarray(True) if meets_in_rounds(world) else may_meet(world, launch(state, t0), dt)
+        near = jnp.asarray(True) if goes_in_rounds(world) else may_meet(world, launch(state, t0), dt)
         end = self._passes(world, start, launch, dt, near)
         return state_at(launch(end.state, end.t0), dt)
 
@@ -106,7 +106,7 @@ class Contact:
         def one_pass(now, phase):
             return _pass(world, now, launch, dt, phase)
 
-        tables = tables_of(world) if meets_in_rounds(world) else ()
+        tables = tables_of(world) if goes_in_rounds(world) else ()
 
         def isolated_or_any(now, phase):
             flight = lax.stop_gradient(launch(now.anchors.state, now.anchors.t0))

@@ -7,16 +7,21 @@ import jax
 import numpy as np
 
 from diffrigid.convert import positive
+from diffrigid.forces import is_constant
 from diffrigid.step import Trajectory, rollout
 from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.records import SAME, Run
 
+LONGEST = 0.02  # [s] of a step, where its length is not given and matters
+
 
 def longest_step(found: Sequence[Run], dt: float | None) -> float:
-    """[s] as given; default the median of the intervals between times."""
+    """[s] as given; default the median of the intervals between times, or LONGEST where forces vary or bodies touch."""
     if dt is not None:
         return float(positive("dt", dt, "it is the longest step in s"))
-    return float(np.median(np.concatenate([np.diff(all_times(run)) for run in found])))
+    frame = float(np.median(np.concatenate([np.diff(all_times(run)) for run in found])))
+    exact = all(is_constant(w.forces) and not (w.joints or w.pairs) for w in (run.world for run in found))
+    return frame if exact else min(frame, LONGEST)
 
 
 def controls_over(run: Run, t: np.ndarray) -> dict[str, np.ndarray] | None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from diffrigid.impacts import find_contacts
+from diffrigid.impacts import contacts
 from diffrigid.step import Trajectory
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import Profile, profile, with_profiles
@@ -101,7 +101,7 @@ def _residuals(fit: Any, motions: Sequence[Trajectory]) -> Section:
 
 def impacts(motion: Trajectory) -> np.ndarray:
     """Times [s] of the impacts of a motion."""
-    found = find_contacts(motion, np.zeros(0))
+    found = contacts(motion, np.zeros(0))
     return np.unique(np.round(found.t[found.impact], 6))
 
 

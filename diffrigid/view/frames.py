@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from diffrigid import impacts
 from diffrigid.forces import Gravity, SpringDamper
-from diffrigid.impacts import find_contacts
 from diffrigid.joints import Distance
 from diffrigid.pytree import align, batch_rank
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Profile, Shape, Sphere, with_topology
@@ -115,7 +115,7 @@ def poses(trajectory: Trajectory) -> np.ndarray:
 
 def contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
     """Rows by time: t [s], 1 for an impact or 0 for rest, point (D) [m], impulse (D) [N s] on one that moves."""
-    found = find_contacts(trajectory, t_drawn)
+    found = impacts.contacts(trajectory, t_drawn)
     return np.column_stack([found.t, found.impact, found.point, found.impulse])
 
 
