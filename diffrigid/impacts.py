@@ -77,7 +77,7 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     Example:
         >>> bounce = dr.contacts(trajectory)
         >>> names = trajectory.world.names + trajectory.world.static_names
-        >>> [(round(t, 2), names[a], names[b]) for t, a, b in zip(bounce.t, bounce.a, bounce.b)]
+        >>> [(round(t, 2), names[a], names[b]) for t, a, b in zip(bounce.t.tolist(), bounce.a, bounce.b)]
         [(0.43, 'ball', 'floor')]
         >>> bounce.impulse.round(2).tolist()  # m (1 + e) u
         [[0.0, 7.56]]

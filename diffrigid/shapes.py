@@ -254,23 +254,6 @@ def edge_apexes(shape: Shape, dim: int) -> tuple:
 # ---- mass, centre of mass, inertia
 
 
-def mass_properties(shape: Shape, density: Array, dim: int) -> tuple[Array, Array, Array]:
-    """Mass, centre of mass and inertia of a homogeneous body, for one shape without batch axes.
-
-    Args:
-        density: [kg/m^2] in 2D, [kg/m^3] in 3D.
-
-    Returns:
-        mass () [kg]; centre of mass (D,) [m] in the shape's axes; inertia about the centre of mass in those
-        axes, () in 2D or (3, 3) in 3D [kg m^2].
-
-    Differentiable in the density and every leaf. A body without volume has no mass: see `volume_properties`.
-    """
-    volume, center, gyration = volume_properties(shape, dim)
-    mass = jnp.asarray(density, volume.dtype) * volume
-    return mass, center, mass * gyration
-
-
 def volume_properties(shape: Shape, dim: int) -> tuple[Array, Array, Array]:
     """Area [m^2] or volume [m^3] (); centre of mass (D,) [m]; inertia per mass [m^2], () in 2D, (3, 3) in 3D.
 

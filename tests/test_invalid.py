@@ -278,12 +278,12 @@ FITS = {
     "column names": (lambda v: fitted(observations={"t": T, v: np.zeros((5, 2))}), ("", "bal", "ball.mass", "ball.x[7]", "ball.x[-1]", 1, None, ("a",))),
     "free": (lambda v: fitted(free=v), (*RECORD, None, {}, {"ball.v": 1.0}, {"bal": dr.real()}, {1: dr.real()}, {(): dr.real()}, {None: dr.real()}, {("ball.v", "ball.mass"): dr.real()}, {"ball.v": dr.direction(), "ball.mass": dr.inertia()})),
     "starts": (lambda v: fitted(starts=v), INTEGER),
-    "iterations": (lambda v: fitted(iterations=v), tuple(v for v in INTEGER if v is not HUGE)),
+    "iterations": (lambda v: fitted(iterations=v), tuple(v for v in optional(INTEGER) if v is not HUGE)),
     "seed": (lambda v: fitted(seed=v), ("a", -1, 1.5, None, object(), np.nan, [1.5])),
     "fit dt": (lambda v: fitted(dt=v), POSITIVE),
     "noise": (lambda v: fitted(noise=v), (*RECORD, {"ball.x": -1.0}, {"ball.x": 0.0}, {"bal": 1.0}, {"ball.x": "a"}, {"ball.x": np.nan}, {"ball.x": np.ones(3)}, {"ball.x": None})),
     "observe": (lambda v: fitted(observe=v), (*RECORD, {"ball.x": 1.0}, {"bal": "ball.x"}, {"ball.x": "bal.x"}, {"ball.x": dr.Marker("bal")}, {"ball.x": dr.Marker("ball", point=(1.0, 2.0, 3.0))}, {"ball.x": None}, {"ball.x": dr.Separation("ball", 1.0)}, {"ball.x": dr.Disc(radius=1.0)}, {"ball.x": lambda s: "a"}, {"ball.x": lambda: 1.0})),
-    "widths": (lambda v: fitted(widths=v), ("a", 1.0, None, (), (-1.0,), ("a",), (np.nan,), (np.inf,), object(), (None,), ((0.1,),))),
+    "widths": (lambda v: fitted(widths=v), ("a", 1.0, (), (-1.0,), ("a",), (np.nan,), (np.inf,), object(), (None,), ((0.1,),))),
     "windows": (lambda v: fitted(windows=v), ("a", 1.0, None, (), (0.0,), ("a",), (np.nan,), object(), (None,), (-1.0,))),
     "loss": (lambda v: fitted(loss=v), (*RECORD, None)),
     "solver": (lambda v: fitted(solver=v), ("a", 1.0, object(), {}, [])),
@@ -350,7 +350,9 @@ def report(failed, count):
 
 def test_nonsense_is_refused_in_words():
     failed = []
-    for name, k in cases():
+    for number, (name, k) in enumerate(cases()):
+        if number % 200 == 199:  # what some of them compile fills gigabytes
+            jax.clear_caches()
         call, pool = TABLE[name]
         if problem := refused(call, pool[k]):
             failed.append(f"{name} = {pool[k]!r:.60}: {problem:.200}")

@@ -1,6 +1,7 @@
 """Shapes against closed forms, quadrature, cuts and shifts; hulls against scipy and Euler's formula."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +20,14 @@ from diffrigid.view.outline import outline
 
 EXACT = 1e-12  # relative: sums of at most some hundred terms in double precision
 DENSITY = 2.5
-mass_properties = jax.jit(shapes.mass_properties, static_argnames="dim")
 TURN = {2: np.array([(3, -4), (4, 3)]) / 5, 3: np.array([(2, -1, 2), (2, 2, -1), (-1, 2, 2)]) / 3}
+
+
+@partial(jax.jit, static_argnames="dim")
+def mass_properties(shape, density, dim):
+    """Mass, centre of mass, inertia."""
+    volume, center, gyration = shapes.volume_properties(shape, dim)
+    return density * volume, center, density * volume * gyration
 
 
 def circle(n):
