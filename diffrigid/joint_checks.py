@@ -68,32 +68,8 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
         fields = [field for field in fields if field != "axis_a" and not (field == "axis_b" and "axis_a" in fields)]
     elif "axis_a" in fields and joint.axis_a is None:
         raise ValueError(f"{name}.axis_a is missing: expected the axis of the hinge in the axes of {joint.a!r}, (3,).")
-    given: dict[str, Any] = {}
-    shapes = {(): (), ("D",): (dim,), ("Q",): (so.Q,)}
-    for field in fields:
-        value = getattr(joint, field)
-        if value is not None:
-            shape = shapes[letters_of(joint, field)]
-            array = numbers(f"{name}.{field}", value, None)
-            array = numbers(f"{name}.{field}", array * np.ones(shape, array.dtype) if array.ndim == 0 else array, shape)
-            given[field] = array
-            if field.startswith("axis"):
-                given[field] = _unit(f"{name}.{field}", array)
-            elif field in ("q", "zero"):
-                given[field] = unit_quaternion(f"{name}.{field}", array)
-            elif field == "length":
-                given[field] = positive(f"{name}.{field}", array, "for a length of 0 use a Ball")
-    at_start = {
-        "anchor_b": lambda a, b, given: so.unrotate(b.q, a.x + so.rotate(a.q, given["anchor_a"]) - b.x),
-        "axis_b": lambda a, b, given: so.unrotate(b.q, so.rotate(a.q, given["axis_a"])),
-        "q": lambda a, b, given: so.difference(b.q, a.q),
-        "zero": lambda a, b, given: so.difference(b.q, a.q),
-        "length": lambda a, b, given: norm(separation(Distance(a=None, **given), so, a, b)),
-    }
-    if not {"lower", "upper", *(("friction", "damping") if dim == 3 else ())} & set(given):
-        at_start.pop("zero")  # in the plane the rate of an angle does not depend on where it is counted from
-    made = {field: known(at_start[field], a, b, given) for field in fields if field in at_start and field not in given}
-    filled = replace(joint, **given, **made, **ends)
+    given = _given(name, joint, fields, dim)
+    filled = replace(joint, **given, **_from_start(so, fields, given, a, b), **ends)
     error = known(lambda joint, a, b: joint(so, a, b), filled, a, b)
     if not traced(error) and np.abs(error).max() > TYPED:
         raise ValueError(
@@ -102,6 +78,42 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
         )
     _check_drive(name, filled, so, a, b)
     return filled
+
+
+def _given(name: str, joint: Any, fields: list[str], dim: int) -> dict[str, Any]:
+    """What the user gave, as arrays: axes and orientations of length one."""
+    shapes = {(): (), ("D",): (dim,), ("Q",): (rotations(dim).Q,)}
+    given: dict[str, Any] = {}
+    for field in fields:
+        if (value := getattr(joint, field)) is None:
+            continue
+        where, shape = f"{name}.{field}", shapes[letters_of(joint, field)]
+        array = numbers(where, value, None)
+        array = numbers(where, array * np.ones(shape, array.dtype) if array.ndim == 0 else array, shape)
+        if field.startswith("axis"):
+            array = _unit(where, array)
+        elif field in ("q", "zero"):
+            array = unit_quaternion(where, array)
+        elif field == "length":
+            array = positive(where, array, "for a length of 0 use a Ball")
+        given[field] = array
+    return given
+
+
+def _from_start(so: Any, fields: list[str], given: dict[str, Any], a: Pose, b: Pose) -> dict[str, Any]:
+    """What was not given, from where the bodies are at the start."""
+    at_start = {
+        "anchor_b": lambda a, b, given: so.unrotate(b.q, a.x + so.rotate(a.q, given["anchor_a"]) - b.x),
+        "axis_b": lambda a, b, given: so.unrotate(b.q, so.rotate(a.q, given["axis_a"])),
+        "q": lambda a, b, given: so.difference(b.q, a.q),
+        "zero": lambda a, b, given: so.difference(b.q, a.q),
+        "length": lambda a, b, given: norm(separation(Distance(a=None, **given), so, a, b)),
+    }
+    # In the plane the rate of an angle does not depend on where it is counted from.
+    counted = {"lower", "upper"} if so.D == 2 else {"lower", "upper", "friction", "damping"}
+    if not counted & set(given):
+        at_start.pop("zero")
+    return {field: known(at_start[field], a, b, given) for field in fields if field in at_start and field not in given}
 
 
 def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:

@@ -39,6 +39,7 @@ CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the f
 ROUGH = 1e-2  # with this relative error, and then with as little as it can
 PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
 SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little
+LITTLE = 0.9  # of the error before: a step that leaves more gained little
 PATIENCE = 3  # rounds that do not halve a small error: then it is rounding
 REFINEMENTS = 8  # of the linear system of the derivative
 
@@ -167,7 +168,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
     """
 
     def solved(nothing):
-        P = _smoothed(SMOOTHING, nothing, cone, v_rel, arms, mobility)
+        P = _smoothed(nothing, cone, v_rel, arms, mobility)
         z, r = _missing(P, cone, v_rel, arms, mobility)
         error = _speed(cone, r)
         start = Search(0, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
@@ -180,7 +181,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility
 def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     """A Newton step, from which P is brought back into the cones.
 
-    Where that gains next to nothing, P is made smoother by some rounds in which each contact takes a share of the
+    Where that gains little, P is made smoother by some rounds in which each contact takes a share of the
     masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
     """
     cone, v_rel, arms, mobility = given
@@ -191,10 +192,10 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     z, r = _missing(P, *given)
 
     def smoothed(P, *_):
-        P = _smoothed(SMOOTHING, P, *given)
+        P = _smoothed(P, *given)
         return P, *_missing(P, *given)
 
-    poor = _lacks(cone, now) & (_speed(cone, r) > 0.9 * now.error)
+    poor = _lacks(cone, now) & (_speed(cone, r) > LITTLE * now.error)
     P, z, r = lax.cond(any_world(poor), smoothed, lambda *kept: kept, P, z, r)
     if mobility.inverse_mass.shape[0] >= PILE:
         circles = (now.count > 0) & (now.count % CIRCLES == 0) & any_world(_circles(cone, now))
@@ -226,12 +227,12 @@ def _missing(P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility)
     return z, allowed(cone, z) - P
 
 
-def _smoothed(rounds: int, P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
+def _smoothed(P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
     def smoother(_, P):
         z = _excess(cone, P, v_rel, arms, mobility)
         return allowed(cone, P + (z - P) / cone.sharing[:, None])
 
-    return lax.fori_loop(0, rounds, smoother, P)
+    return lax.fori_loop(0, SMOOTHING, smoother, P)
 
 
 def _speed(cone: Cone, P: Array) -> Array:
