@@ -275,7 +275,7 @@ def _solve_together_jvp(primals, tangents):
     def linear(x):
         return x - _sloped(slope, x - moved(x, arms, mobility) / cone.scale[:, None])
 
-    def refined(matvec, b, transposed):
+    def refined(system, b, transposed):
         matrix = bodies_matrix(_answer(*fixed[:2]), *fixed[2:])
         inverse = solve_regular(matrix, identity(matrix))
 
@@ -283,9 +283,9 @@ def _solve_together_jvp(primals, tangents):
             return _newton_step(r, functools.partial(matvec, inverse), *fixed)
 
         approximate = (lambda r: jax.linear_transpose(step, b)(r)[0]) if transposed else step
-        return lax.fori_loop(0, REFINEMENTS, lambda _, x: x + approximate(b - matvec(x)), jnp.zeros_like(b))
+        return lax.fori_loop(0, REFINEMENTS, lambda _, x: x + approximate(b - system(x)), jnp.zeros_like(b))
 
-    def solve(matvec, b, transposed=False):
-        return lax.cond(shared, lambda b: refined(matvec, b, transposed), jnp.zeros_like, b)
+    def solve(system, b, transposed=False):
+        return lax.cond(shared, lambda b: refined(system, b, transposed), jnp.zeros_like, b)
 
     return P, lax.custom_linear_solve(linear, change, solve, transpose_solve=functools.partial(solve, transposed=True))

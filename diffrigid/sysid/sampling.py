@@ -28,7 +28,8 @@ from diffrigid.sysid.problem import Data, Plan, linearised
 from diffrigid.sysid.result import Fit, references, unit_of
 from diffrigid.sysid.setup import Problem, scene_of
 from diffrigid.sysid.summary import Parameter
-from diffrigid.sysid.table import laid_out, rows
+from diffrigid.sysid.table import rows
+from diffrigid.tables import lined_up
 
 ACCEPTED = 0.8  # [-] share of proposals that the length of the steps is tuned to
 SETTLED = 1.01  # R-hat above which chains have not found the same
@@ -59,7 +60,7 @@ class Posterior:
             (name, mean, interval, fitted[2], unit, *quality(name))
             for (name, mean, interval, unit, _), fitted in zip(rows(self), rows(self.fit), strict=True)
         ]
-        return "\n".join([*laid_out(HEADER, table), *(f"! {note}" for note in self.notes)])
+        return "\n".join([*lined_up(HEADER, table), *(f"! {note}" for note in self.notes)])
 
 
 def sample(fit: Fit, draws: int = 1000, *, chains: int = 4, warmup: int = 300, seed: int = 0) -> Posterior:

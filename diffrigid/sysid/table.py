@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid.sysid.orders import in_words
+from diffrigid.tables import as_html, digits, lined_up
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
 SHOWN = 3  # records whose own numbers are in the table
@@ -22,9 +23,9 @@ def rows(fit: Any) -> list[tuple[str, ...]]:
                 continue
             name = p.name + "".join(f"{{{k}}}" for k in record) + (f"[{', '.join(map(str, part))}]" if part else "")
             value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
-            digits = _digits(value, low, high)
-            interval = f"{low:.{digits}g} .. {high:.{digits}g}"
-            out.append((name, f"{value:.{digits}g}", interval, p.unit or "-", p.note))
+            places = digits(value, low, high, 3)
+            interval = f"{low:.{places}g} .. {high:.{places}g}"
+            out.append((name, f"{value:.{places}g}", interval, p.unit or "-", p.note))
         if p.records > SHOWN:
             out.append((p.name, "...", "", "", f"and {p.records - SHOWN} more records"))
     return out
@@ -33,14 +34,6 @@ def rows(fit: Any) -> list[tuple[str, ...]]:
 def number_names(slots: Sequence) -> list[str]:
     """Names of the numbers of z of some parameters, in order."""
     return [slot.name if slot.size == 1 else f"{slot.name}[{k}]" for slot in slots for k in range(slot.size)]
-
-
-def _digits(value: float, low: float, high: float) -> int:
-    """Digits that show the interval to two places."""
-    width, size = abs(high - low), max(abs(value), abs(low), abs(high))
-    if not np.isfinite(width) or width == 0 or size == 0:
-        return 4
-    return int(np.clip(np.ceil(np.log10(size / width)) + 2, 3, 12))
 
 
 def below(fit: Any) -> list[str]:
@@ -70,22 +63,11 @@ def _others(fit: Any) -> str:
 
 def text_table(fit: Any) -> str:
     """The table in plain text, with the notes under it."""
-    return "\n".join([*laid_out(HEADER, rows(fit)), *below(fit), *(f"! {note}" for note in fit.notes)])
-
-
-def laid_out(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table, in columns, between rules."""
-    table = [header, *rows]
-    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
-    rule = "-" * max(map(len, lines))
-    return [lines[0], rule, *lines[1:], rule]
+    return "\n".join([*lined_up(HEADER, rows(fit)), *below(fit), *(f"! {note}" for note in fit.notes)])
 
 
 def html_table(fit: Any) -> str:
     """The table for a notebook."""
-    head = "".join(f"<th>{cell}</th>" for cell in HEADER)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows(fit))
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in fit.notes)
     lines = "".join(f"<p>{html.escape(line)}</p>" for line in below(fit))
-    return f"<table><tr>{head}</tr>{body}</table>{lines}" + (f"<ul>{notes}</ul>" if notes else "")
+    return as_html(HEADER, rows(fit)) + lines + (f"<ul>{notes}</ul>" if notes else "")

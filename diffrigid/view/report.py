@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from diffrigid.tables import as_html, digits, lined_up
 from diffrigid.view.play import POLICY, Player
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "truth or published value")
@@ -67,26 +68,19 @@ def write_report(path: str | Path, title: str, lead: str, sections: Sequence[Sec
 def row(name: str, values: Sequence[float] | np.ndarray, unit: str, reference: str) -> Row:
     """One row of a table: value, low, high with as many digits as show the interval to two places."""
     v, l, h = (float(number) for number in values)
-    digits = _digits(v, l, h)
-    value, low, high = (f"{number:#.{digits}g}".rstrip(".") for number in (v, l, h))
+    places = digits(v, l, h, 2)
+    value, low, high = (f"{number:#.{places}g}".rstrip(".") for number in (v, l, h))
     return name, value, f"{low} to {high}", unit, reference
 
 
 def text_table(rows: Sequence[Row]) -> str:
     """Rows under HEADER, as text."""
-    table = [HEADER, *rows]
-    widths = [max(len(line[column]) for line in table) for column in range(len(HEADER))]
-    padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in table]
-    lines = ["  ".join(cells).rstrip() for cells in padded]
-    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+    return "\n".join(lined_up(HEADER, rows))
 
 
 def html_table(rows: Sequence[Row], header: Row = HEADER) -> str:
-    """Rows under a header, as HTML."""
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
-    lines = ["".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in rows]
-    body = "".join(f"<tr>{line}</tr>\n" for line in lines)
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>\n'
+    """Rows under a header, as HTML that scrolls if it is wide."""
+    return f'<div class="wide">{as_html(header, rows)}</div>\n'
 
 
 def chart(
@@ -157,14 +151,6 @@ def _section(section: Section) -> str:
         parts.append(f"<details><summary>{html.escape(summary)}</summary>\n")
         parts.append(f'<div class="wide">{content}</div></details>\n')
     return "".join(parts) + "</section>\n"
-
-
-def _digits(value: float, low: float, high: float) -> int:
-    """Significant digits that show the width of an interval to two places."""
-    width, size = abs(high - low), max(abs(value), abs(low), abs(high))
-    if not np.isfinite(width) or width == 0 or size == 0:
-        return 4
-    return int(np.clip(np.ceil(np.log10(size / width)) + 2, 2, 12))
 
 
 def _range(columns: Sequence[np.ndarray], margin: float) -> tuple[float, float]:
