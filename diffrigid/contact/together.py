@@ -31,7 +31,7 @@ from jax.ad_checkpoint import checkpoint_name
 from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
-from diffrigid.numerics import FOUND, any_world, dot, identity, norm, safe_divide, solve_regular
+from diffrigid.numerics import FOUND, any_world, dot, identity, matvec, norm, safe_divide, solve_regular
 from diffrigid.pytree import array, pytree, replace
 
 ROUNDS = 40  # at most, of Newton's method
