@@ -12,6 +12,7 @@ import numpy as np
 
 from diffrigid.convert import known
 from diffrigid.shapes import HalfSpace, edges, radius, vertices
+from diffrigid.touch import rotated
 
 
 class Placed(NamedTuple):
@@ -34,12 +35,12 @@ class Placed(NamedTuple):
 def place(shape: Any, x: np.ndarray, q: np.ndarray, center: np.ndarray) -> Placed:
     """A shape of which the point `center` is at x (D,) [m], with orientation q."""
     dim = len(x)
-    x = x - _rotate(q, np.asarray(center)[None])[0]
+    x = x - rotated(q, np.asarray(center))
     if isinstance(shape, HalfSpace):
-        normal = _rotate(q, np.asarray(shape.normal)[None])[0]
+        normal = rotated(q, np.asarray(shape.normal))
         none = np.zeros((0, dim))
         return Placed((x + shape.offset * normal)[None], none, none, 0.0, normal)
-    corners = x + _rotate(q, known(lambda s: vertices(s, dim), shape))
+    corners = x + rotated(q, known(lambda s: vertices(s, dim), shape))
     if dim == 3:
         pairs = edges(shape, dim)
     else:
@@ -47,15 +48,6 @@ def place(shape: Any, x: np.ndarray, q: np.ndarray, center: np.ndarray) -> Place
     ends = np.array(pairs, int).reshape(-1, 2)
     starts = corners[ends[:, 0]]
     return Placed(corners, corners[ends[:, 1]] - starts, starts, float(known(radius, shape)), None)
-
-
-def _rotate(q, rows):
-    """Rows (V, D) from body to world axes."""
-    if len(q) == 2:
-        return rows @ np.array([[q[0], q[1]], [-q[1], q[0]]])
-    s, u = q[0], q[1:]
-    t = 2.0 * np.cross(u, rows)
-    return rows + s * t + np.cross(u, t)
 
 
 def separation(a: Placed, b: Placed) -> float:
