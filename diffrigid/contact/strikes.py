@@ -70,7 +70,7 @@ def waits(world: Any) -> bool:
     column, drives = ends(world), driven(world)
     pairs = tuple(dict.fromkeys(zip(column["a"], column["b"], strict=True)))
     a, b = zip(*pairs, strict=True)
-    alone = are_alone(a, b, len(world.names))
+    alone = are_alone(a, b, len(world.names)) and all(pairs.count == 1 for pairs in world.pairs)
     return not all(drives) and (any(drives) or (bool(world.forces) and not alone))
 
 
