@@ -31,6 +31,7 @@ class Arms:
     mid_b: Any = array("C", "D", default=None)
     turn: Any = array("C", "A", default=None)  # [rad] by which they act turned
     jac: Any = array("R", "2", "D + A", default=None)  # of each coordinate by the twists of a and b
+    mid_jac: Any = array("R", "2", "D + A", default=None)  # when its impulse acts
     spin: Any = array("K", default=None)
     a: tuple[int, ...] = static()
     b: tuple[int, ...] = static()
@@ -65,8 +66,8 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
             turns.append(sign * every[points : 2 * points, : so.A])
     if arms.jac is not None:
         for side, (pushes, turns) in enumerate(zip(push, moments, strict=True)):
-            pushes.append(along * arms.jac[:, side, : so.D])
-            turns.append(along * arms.jac[:, side, so.D :])
+            pushes.append(along * arms.mid_jac[:, side, : so.D])
+            turns.append(along * arms.mid_jac[:, side, so.D :])
 
     def total(on_a: list[Array], on_b: list[Array]) -> Array:
         return side_sum(_joined(on_a), _joined(on_b), arms.a, arms.b, moving)
@@ -188,18 +189,20 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     so = rotations(D)
     size = D + so.A
 
-    def by_units(arm: Array, side: int) -> Array:  # (C, size, D)
+    def by_units(arm: Array, all_jac: Array | None, side: int) -> Array:  # (C, size, D)
         J = jax.vmap(lambda arm: _by_units(so, arm))(arm)
         if arms.spin is not None:
             turns = jnp.eye(size, dtype=arm.dtype)[:, D:].reshape(1, size, so.A, *[1] * len(batch))
             J = put(arms.spin, J, jnp.broadcast_to(_as_vectors(turns[0], D), (len(arms.spin), size, D, *batch)))
-        if arms.jac is not None:
-            rows = jax.vmap(lambda jac: _first(jac, D))(arms.jac[:, side])
+        if all_jac is not None:
+            rows = jax.vmap(lambda jac: _first(jac, D))(all_jac[:, side])
             J = jnp.concatenate([J[: len(arms.a) - len(arms.jac)], rows if side == 0 else -rows])
         return J
 
-    J_a, J_b = by_units(arms.arm_a, 0), by_units(arms.arm_b, 1)
-    mid_a, mid_b = (J_a, J_b) if arms.mid_a is None else (by_units(arm, side) for side, arm in enumerate(mids(arms)))
+    J_a, J_b = (by_units(arm, arms.jac, side) for side, arm in enumerate((arms.arm_a, arms.arm_b)))
+    mid_a, mid_b = J_a, J_b
+    if arms.mid_a is not None or arms.jac is not None:
+        mid_a, mid_b = (by_units(arm, arms.mid_jac, side) for side, arm in enumerate(mids(arms)))
     if arms.turn is not None:  # P + turn x P, by the velocities that it acts on
         mid_a, mid_b = (J - jax.vmap(jax.vmap(so.cross, (None, 0)))(arms.turn, J) for J in (mid_a, mid_b))
 

@@ -39,6 +39,7 @@ class Strikes:
     a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
     b: tuple[int, ...] = static(default=())
     jac: Any = array("R", "2", "D + A", default=None)  # of the last R, which are rows of joints; see `Arms`
+    mid_jac: Any = array("R", "2", "D + A", default=None)
     spin: Any = array("K", default=None)  # [m] of K rows behind the first K contacts, against turning; see `Cone`
 
 
@@ -77,7 +78,7 @@ def solve_impulses(strikes: Strikes, law: Law, mobility: Mobility, count: Array,
     )  # fmt: skip
     arms = Arms(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, mid_a=strikes.mid_a, mid_b=strikes.mid_b, turn=strikes.turn,
-        jac=strikes.jac, spin=strikes.spin, a=strikes.a, b=strikes.b,
+        jac=strikes.jac, mid_jac=strikes.mid_jac, spin=strikes.spin, a=strikes.a, b=strikes.b,
     )  # fmt: skip
     return alone + solve_without_gain(cone, strikes.v_rel, arms, mobility)
 

@@ -57,8 +57,8 @@ def with_rows(
         pull=turns(pull), drift=none, rests=strikes.rests[:count], now=strikes.now[:count], held=strikes.held[:count],
     )  # fmt: skip
     strikes = replace(
-        jax.tree.map(lambda old, new: _behind(count, old, new), replace(strikes, a=(), b=(), jac=None), rows),
-        a=a + a + strikes.a[count:], b=b + b + strikes.b[count:], jac=strikes.jac, spin=spin,
+        jax.tree.map(lambda old, new: _behind(count, old, new), replace(strikes, a=(), b=(), jac=None, mid_jac=None), rows),
+        a=a + a + strikes.a[count:], b=b + b + strikes.b[count:], jac=strikes.jac, mid_jac=strikes.mid_jac, spin=spin,
     )  # fmt: skip
     target, mu, most = law
     mu = jnp.broadcast_to(mu, target.shape)
@@ -110,7 +110,7 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: A
 def rows_of(strikes: Strikes) -> Strikes:
     """The rows that turn."""
     spin, count = strikes.spin, len(strikes.spin)
-    rows = jax.tree.map(partial(turning, spin), replace(strikes, a=(), b=(), jac=None, spin=None))
+    rows = jax.tree.map(partial(turning, spin), replace(strikes, a=(), b=(), jac=None, mid_jac=None, spin=None))
     return replace(rows, a=strikes.a[:count], b=strikes.b[:count])
 
 
@@ -151,7 +151,7 @@ def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array
     def others(values: Any) -> Any:
         return jax.tree.map(lambda leaf: jnp.concatenate([leaf[:count], leaf[2 * count :]]), values)
 
-    free = replace(strikes, v_rel=strikes.v_rel + by_torque, pull=pull, a=(), b=(), jac=None, spin=None)
+    free = replace(strikes, v_rel=strikes.v_rel + by_torque, pull=pull, a=(), b=(), jac=None, mid_jac=None, spin=None)
     a, b = (side[:count] + side[2 * count :] for side in (strikes.a, strikes.b))
     early = stopping_early(mobility, replace(others(free), a=a, b=b), others(P), others(law), others(T))
     return jnp.concatenate([early[:count], jnp.zeros_like(turning(spin, P)), early[count:]])

@@ -26,7 +26,7 @@ def keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array
     jac = None if strikes.jac is None else jnp.zeros_like(strikes.jac)
     if strikes.spin is not None:  # torques displace nothing
         P = put(strikes.spin, P, jnp.zeros_like(turning(strikes.spin, P)))
-    return momentum_changes(replace(strikes, mid_a=drift, mid_b=-drift, jac=jac), P, moving)[1]
+    return momentum_changes(replace(strikes, mid_a=drift, mid_b=-drift, jac=jac, mid_jac=jac), P, moving)[1]
 
 
 def drift_after(strikes: Strikes, dv: Array) -> Array:

@@ -150,8 +150,11 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
     inverses = [so.world_inverse(f.inverse_inertia, pose.q) for f, pose in zip((a, b), poses, strict=True)]
     spins = [so.apply(i, angular_momentum(f, s)) for i, f in zip(inverses, (a, b), strict=True)]
     twists = [jnp.concatenate([velocity(f, s), w]) for f, w in zip((a, b), spins, strict=True)]
-    along = sign * by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], *poses)[0]
-    jac = along.reshape(2, so.D + so.A, *s.shape)
+    middle = s - 0.5 * jnp.where(meeting.held, s - jnp.maximum(a.t0, b.t0), 0.0)
+    then: Any = [Pose(position(f, middle), orientation(f, middle)) for f in (a, b)]
+    both = jax.tree.map(lambda *two: jnp.stack(two), poses, then)
+    along = jax.vmap(lambda a, b: by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0])(*both)
+    jac, mid_jac = sign * along.reshape(2, 2, so.D + so.A, *s.shape)
     rate = (jac * jnp.stack(twists)).sum((0, 1))
     mobile = [f.inverse_mass * (j[: so.D] ** 2).sum(0) for f, j in zip((a, b), jac, strict=True)]
     mobile += [(j[so.D :] * so.apply(i, j[so.D :])).sum(0) for i, j in zip(inverses, jac, strict=True)]
@@ -168,7 +171,7 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
         active=meeting.hit & touches, s=s, gap=open_by, normal=first, arm_a=none, arm_b=none,
         K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,
         pull=pull[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now,
-        held=meeting.held, jac=jac,
+        held=meeting.held, jac=jac, mid_jac=mid_jac,
     )  # fmt: skip
 
 

@@ -42,17 +42,17 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
     links = Links(a, b, islands(world.joints, len(world.names)))
     meetings = in_order(meetings, links, flight.t0, dt, at_end, bounces)
-    parts, jac = [], None
+    parts, jacs = [], {}
     for sides, meeting in zip(groups, meetings, strict=False):
         each = jax.vmap(lambda a, b, meeting: strikes_of(a, b, meeting, dt, is_loaded(world)))
         part = unfused(opaque_true(dt), each, *sides, meeting)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1])
-        jac = stops.jac
+        jacs = {"jac": stops.jac, "mid_jac": stops.mid_jac}
         mid = stops.arm_a if is_loaded(world) else None
-        parts.append(replace(stops, jac=None, mid_a=mid, mid_b=mid))
-    return replace(_joined(parts), **ends(world), jac=jac)
+        parts.append(replace(stops, jac=None, mid_jac=None, mid_a=mid, mid_b=mid))
+    return replace(_joined(parts), **ends(world), **jacs)
 
 
 def _joined(parts: list[Strikes]) -> Strikes:
