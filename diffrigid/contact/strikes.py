@@ -112,7 +112,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array, loaded: bool) -> S
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
         touching = (gap > 0) & (gap <= meeting.slack)  # open by no more than rounding
         return Strikes(
-            active=gap < 0, s=s, gap=jnp.where(touching, 0.0, gap), normal=contact.normal, arm_a=lever.arm_a,
+            active=gap < 0, s=s, gap=jnp.where(touching, gap - lax.stop_gradient(gap), gap), normal=contact.normal, arm_a=lever.arm_a,
             arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
             K=effective_matrix(at_a, at_b, lever), v_rel=relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b),
             pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
