@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from closed_form import with_slopes
 from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
 
 import diffrigid as dr
 from diffrigid import so3
@@ -203,6 +204,24 @@ def test_limits_may_lie_beyond_half_a_turn(dim):
     bounced = end(4.0, 4.5, False)
     assert_allclose(bounced if dim == 2 else 2 * np.pi - bounced, 4.0 - 0.6 * 0.5, atol=EXACT)
     assert_allclose(jnp.abs(end(0.5, -4.5, True)), 4.5 if dim == 2 else 2 * np.pi - 4.5, atol=EXACT)
+
+
+def test_friction_of_a_slider_keeps_the_spin_of_its_rod():
+    """A bead rubs on a rod that turns freely: its friction acts along the rod of the middle of each step."""
+    mass, inertia, rub = 0.5, 0.21, 0.15
+    rod = dr.Body(None, mass=1.0, inertia=0.2, x=(0.0, 0.0), w=3.0)
+    bead = dr.Body(None, mass=mass, inertia=0.01, x=(0.3, 0.0), v=(0.0, 0.9), w=3.0)
+    along = dr.Prismatic("bead", "rod", axis_b=(1.0, 0.0), anchor_b=(0.0, 0.0), friction=rub)
+    world, state = dr.scene({"rod": rod, "bead": bead}, joints=[dr.Revolute("rod", anchor_a=(0.0, 0.0)), along])
+    end = jax.tree.map(lambda leaf: leaf[-1], dr.rollout(world, state, dt=1 / 240, steps=120).state)
+
+    def rate(_, y):
+        return [y[1], y[0] * y[2] ** 2 - rub / mass, -2 * mass * y[0] * y[1] * y[2] / (inertia + mass * y[0] ** 2)]
+
+    expected = solve_ivp(rate, (0.0, 0.5), [0.3, 0.0, 3.0], rtol=1e-11, atol=1e-11).y[:, -1]
+    assert_allclose([end.x[1] @ end.q[0], end.v[1] @ end.q[0], end.w[0, 0]], expected, rtol=1e-5)
+    spin = (inertia + mass * (end.x[1] @ end.x[1])) * end.w[0, 0]
+    assert_allclose(spin, (inertia + mass * 0.09) * 3.0, rtol=1e-7)
 
 
 def test_friction_turns_back_with_the_motion():

@@ -147,7 +147,7 @@ class Progress(NamedTuple):
 def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
     (anchors, resting, known, *_), (impact, reverse, push) = now, (phase == kind for kind in (IMPACT, REVERSE, PUSH))
     flight = launch(anchors.state, anchors.t0)
-    strikes = find_strikes(world, flight, anchors.since, dt, ~impact)
+    strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting)
     strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
     if known is not None:
         skips = reverse & ~known.reverses()

@@ -57,7 +57,7 @@ def with_rows(
         pull=turns(pull), drift=none, rests=strikes.rests[:count], now=strikes.now[:count], held=strikes.held[:count],
     )  # fmt: skip
     strikes = replace(
-        jax.tree.map(lambda old, new: _behind(count, old, new), replace(strikes, a=(), b=(), jac=None, mid_jac=None), rows),
+        jax.tree.map(partial(_behind, count), replace(strikes, a=(), b=(), jac=None, mid_jac=None), rows),
         a=a + a + strikes.a[count:], b=b + b + strikes.b[count:], jac=strikes.jac, mid_jac=strikes.mid_jac, spin=spin,
     )  # fmt: skip
     target, mu, most = law

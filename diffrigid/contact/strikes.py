@@ -27,10 +27,11 @@ from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
 
 
-def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array) -> Strikes:
+def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array) -> Strikes:
     """The contacts of every pair at its next impact, or where it is held until; all at the end where `at_end` (a bool).
 
-    Active are those that touch then; of the next impact, only if it happens before the end.
+    Active are those that touch then; of the next impact, only if it happens before the end. What has rested (C, *batch)
+    still touches where it has opened by no more than a body falls in a step.
     """
     width = world.contact.width
     groups = [sides_of(world, pairs, flight, since) for pairs in world.pairs]
@@ -42,10 +43,12 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
     links = Links(a, b, islands(world.joints, len(world.names)))
     meetings = in_order(meetings, links, flight.t0, dt, at_end, bounces)
-    parts, jacs = [], {}
-    for sides, meeting in zip(groups, meetings, strict=False):
-        each = jax.vmap(lambda a, b, meeting: strikes_of(a, b, meeting, dt, is_loaded(world)))
-        part = unfused(opaque_true(dt), each, *sides, meeting)
+    parts, jacs, start = [], {}, 0
+    for pairs, sides, meeting in zip(world.pairs, groups, meetings, strict=False):
+        rested = resting[start : start + len(pairs.a) * pairs.count].reshape(-1, pairs.count, *dt.shape)
+        start += len(pairs.a) * pairs.count
+        each = jax.vmap(lambda a, b, meeting, rested: strikes_of(a, b, meeting, rested, dt, is_loaded(world)))
+        part = unfused(opaque_true(dt), each, *sides, meeting, rested)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1])
@@ -88,17 +91,18 @@ def next_meeting(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: 
 def next_strikes(world: Any, a: Side, b: Side, dt: Array) -> Strikes:
     """The contacts of one pair at its next exact impact, (K, ...)."""
     meeting, never = next_meeting(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
-    return strikes_of(a, b, replace(meeting, now=meeting.fast, joins=never, held=never), dt, False)
+    return strikes_of(a, b, replace(meeting, now=meeting.fast, joins=never, held=never), never[None], dt, False)
 
 
-def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array, loaded: bool) -> Strikes:
+def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loaded: bool) -> Strikes:
     """The contacts of one pair, (K, ...); see `find_strikes`. They are `loaded` if forces act in this world."""
     s, held, live = meeting.s, meeting.held, opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
     contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
     # Also contacts that opened because the body below fell away: they may close again once it is held, or struck.
-    opened = jnp.where(held | meeting.joins, dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None), 0.0)
-    near = contacts.gap <= (meeting.level + meeting.slack + opened)[None]
+    fall = dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None)
+    opened = jnp.where((held | meeting.joins)[None] | rested, fall[None], 0.0)
+    near = contacts.gap <= (meeting.level + meeting.slack)[None] + opened
     active = (near | (meeting.rests & held[None])) & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
@@ -110,9 +114,10 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, dt: Array, loaded: bool) -> S
         arms = (a, at_a, lever.arm_a), (b, at_b, lever.arm_b)
         pulls: list[Any] = [acceleration(side, at, s, arm, lever.rate) for side, at, arm in arms]
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
-        touching = (gap > 0) & (gap <= meeting.slack)  # open by no more than rounding
+        # Open by no more than rounding: closed, but it moves with the parameters as any other.
+        gap = jnp.where((gap > 0) & (gap <= meeting.slack), gap - lax.stop_gradient(gap), gap)
         return Strikes(
-            active=gap < 0, s=s, gap=jnp.where(touching, gap - lax.stop_gradient(gap), gap), normal=contact.normal, arm_a=lever.arm_a,
+            active=gap < 0, s=s, gap=gap, normal=contact.normal, arm_a=lever.arm_a,
             arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
             K=effective_matrix(at_a, at_b, lever), v_rel=relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b),
             pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
