@@ -69,7 +69,8 @@ def _joined(parts: list[Strikes]) -> Strikes:
 
 
 def waits(world: Any) -> bool:
-    """Whether what rests may have to be held until an impact: something acts on it, and it meets others. Static."""
+    """Whether what rests may have to be held until an impact: something acts on it, and it meets others, or the same
+    in several points. Static."""
     column, drives = ends(world), driven(world)
     pairs = tuple(dict.fromkeys(zip(column["a"], column["b"], strict=True)))
     a, b = zip(*pairs, strict=True)
