@@ -68,20 +68,22 @@ class Revolute:
         return jnp.concatenate([apart, jnp.stack([dot(so.rotate(b.q, t), along) for t in tangents(self.axis_b)])])
 
     def coordinate(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        """Angle of a against b about the axis, (*batch) [rad], within pi of `middle`."""
-        turned, middle = so.difference(b.q, a.q), self.middle()
-        about = middle[None] if so.D == 2 else middle[None] * self.axis_a
-        zero = so.exp(about) if self.zero is None else so.turn_in_body(self.zero, about)
-        angle = so.log(so.difference(zero, turned))
-        return middle + (angle[0] if so.D == 2 else dot(self.axis_a, angle))
+        """Angle of a against b about the axis, (*batch) [rad], within pi of the middle of its limits, else of 0."""
+        turned, zero, middle = so.difference(b.q, a.q), self.zero, self._middle()
+        if middle is not None:
+            zero = so.turn_in_body(zero, middle[None] if so.D == 2 else middle[None] * self.axis_a)
+        angle = so.log(turned if zero is None else so.difference(zero, turned))
+        along = angle[0] if so.D == 2 else dot(self.axis_a, angle)
+        return along if middle is None else middle + along
 
-    def middle(self) -> Array:
-        """Angle half a turn from that at which angles jump, (*batch) [rad]."""
-        if self.lower is not None and self.upper is not None:
-            return 0.5 * (jnp.asarray(self.lower) + jnp.asarray(self.upper))
-        if self.lower is not None:
-            return jnp.asarray(self.lower) + 0.75 * jnp.pi
-        return jnp.zeros(()) if self.upper is None else jnp.asarray(self.upper) - 0.75 * jnp.pi
+    def _middle(self) -> Array | None:
+        """Angle half a turn from that at which angles jump, (*batch) [rad]; None: there are no limits."""
+        lower, upper = (None if limit is None else jnp.asarray(limit) for limit in (self.lower, self.upper))
+        if lower is not None and upper is not None:
+            return 0.5 * (lower + upper)
+        if lower is not None:
+            return lower + 0.75 * jnp.pi
+        return None if upper is None else upper - 0.75 * jnp.pi
 
 
 @pytree
