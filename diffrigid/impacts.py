@@ -65,8 +65,10 @@ class Motion(NamedTuple):
 
 
 def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meetings:
-    """When, where and with what impulses bodies of a trajectory touch: `t`, `impact` (or rest), colliders `a` and `b`,
-    `point` and `impulse`, in order of time. NumPy, without derivatives.
+    """When, where and with what impulses bodies of a trajectory touch, M contacts in order of time.
+
+    `t` (M,) [s], `impact` (M,) or else rest, colliders `a` and `b` (M,) numbered as bodies, then statics; in world axes
+    `point` (M, D) [m] and `impulse` (M, D) [N s] on `a`, or on `b` where only that moves. NumPy, without derivatives.
 
     A trajectory stores states, and not impulses: these are the least that explain its changes of momentum. Contacts
     with a `Profile` or a `HeightField` are not found.

@@ -160,7 +160,7 @@ def any_world(flags: Array) -> Array:
 
 
 @any_world.def_vmap
-def _some_of_all(size: int, batched: list[bool], flags: Array) -> tuple[Array, bool]:
+def _of_all_worlds(size: int, batched: list[bool], flags: Array) -> tuple[Array, bool]:
     del size, batched
     return any_world(flags), False
 

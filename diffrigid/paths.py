@@ -103,7 +103,7 @@ def unit(world: World, path: str) -> str:
 
 
 def places(world: World, path: str) -> list[Place]:
-    """The leaves that a path names, or a component of them.
+    """The leaves that a path names; of a component those of the whole vector.
 
     Raises:
         ValueError: there is no such parameter; the message lists the nearest.

@@ -28,9 +28,7 @@ class Known:
     """Impulses that are known, on body a of each contact and row; else 0."""
 
     P: Array = array("C", "D")  # [N s]; where gaps are closed [kg m]
-    early: Array = array(
-        "C", "D"
-    )  # [N s^2] what they move bodies by beside an even force: not 0 where friction reverses
+    early: Array = array("C", "D")  # [N s^2] what they move bodies by beside an even force: where friction reverses
 
     def reverses(self) -> Array:
         """Whether some friction reverses in a world, (*batch) bool."""
