@@ -17,7 +17,7 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.contact.order import Meeting
-from diffrigid.contact.search import NEAR, approach_search, if_smooth, touches
+from diffrigid.contact.search import NEAR, approach_search, at_corners, if_smooth, touches
 from diffrigid.contact.sides import (
     Side,
     centre,
@@ -78,8 +78,9 @@ def find_impact(
     at_once = jnp.any(closing & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
     s = jnp.where(at_once, begin, s)
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
-    # Which of the many places of a grid rest is not what the contacts are numbered by.
-    rests = rests if len(rests) == len(gap) else jnp.broadcast_to(rests.any(0), gap.shape)
+    if len(rests) != len(gap):  # contacts are some of many places: of the corners of a box, or of those of a grid
+        few = isinstance(b.shape, HalfSpace)
+        rests = at_corners(a, at_a, moved, rests) if few else jnp.broadcast_to(rests.any(0), gap.shape)
     return Meeting(s=s, hit=hit | at_end, fast=closing.any(0), rests=rests & ~at_end, level=level, slack=slack)
 
 

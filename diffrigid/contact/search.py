@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.collide import Contacts
 from diffrigid.collide.heights import height_over, unseen_for
 from diffrigid.contact.sides import (
     Placed,
@@ -98,8 +99,7 @@ def _corner_motion(a: Side, at: Placed, b: Side) -> tuple[Array, Array, Array]:
     dim = len(at.x)
     so = rotations(dim)
     normal = so.rotate(b.q, b.shape.normal)
-    r = vertices(a.shape, dim)
-    r = r if a.offset is None else r + a.offset[None]
+    r = _corners(a, dim)
     turning = so.cross(at.w, normal)
     axes = [normal, -turning, so.cross(at.w, turning) - so.cross(at.dw, normal)]
     heights = [dot(normal, at.x - b.x) - b.shape.offset - radius(a.shape), dot(normal, at.v), dot(normal, at.a)]
@@ -107,6 +107,23 @@ def _corner_motion(a: Side, at: Placed, b: Side) -> tuple[Array, Array, Array]:
         h[None] + jax.vmap(dot, (None, 0))(so.unrotate(at.q, n), r) for h, n in zip(heights, axes, strict=True)
     )
     return height, rate, acceleration
+
+
+def at_corners(a: Side, at: Placed, contacts: Contacts, of_corners: Array) -> Array:
+    """What holds of corners of a, (V, *batch) bool, for contacts with a half-space at some of them, (K, *batch)."""
+    so, margin = rotations(len(at.x)), NEAR * reach_of(a)
+
+    def one(gap: Array, normal: Array, point: Array) -> Array:
+        corner = so.unrotate(at.q, point + (radius(a.shape) + 0.5 * gap)[None] * normal - at.x)
+        return (of_corners & (jax.vmap(norm)(_corners(a, len(at.x)) - corner[None]) <= margin[None])).any(0)
+
+    return lax.stop_gradient(jax.vmap(one)(contacts.gap, contacts.normal, contacts.point))
+
+
+def _corners(a: Side, dim: int) -> Array:
+    """Vertices of the core of a from its centre of mass, body axes, (V, D, *batch) [m]."""
+    r = vertices(a.shape, dim)
+    return r if a.offset is None else r + a.offset[None]
 
 
 def _time_to(height: Array, v: Array, acc: Array) -> Array:

@@ -116,7 +116,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
         pulls: list[Any] = [acceleration(side, at, s, arm, lever.rate) for side, at, arm in arms]
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
         # Open by no more than rounding: closed, but it moves with the parameters as any other.
-        gap = jnp.where((gap > 0) & (gap <= meeting.slack), gap - lax.stop_gradient(gap), gap)
+        gap = jnp.where((gap > 0) & (gap <= 100.0 * jnp.sqrt(jnp.finfo(gap.dtype).eps) * meeting.slack), gap - lax.stop_gradient(gap), gap)
         return Strikes(
             active=gap < 0, s=s, gap=gap, normal=contact.normal, arm_a=lever.arm_a,
             arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
