@@ -110,14 +110,33 @@ def test_ball_slips_then_rolls(case):
     assert_allclose(slopes, jax.jacfwd(expected, (0, 1, 2))(*p), atol=1e-9)
 
 
-def test_cradle_of_touching_balls():
+@pytest.mark.parametrize("rounding", [0.0, 1e-18])
+def test_cradle_of_touching_balls(rounding):
     """Five that touch, struck by a sixth: the last flies off, the others stay."""
-    bodies = {f"b{k}": dr.Body(dr.Disc(radius=0.5), mass=1.0, x=(1.0 * k, 0.0)) for k in range(5)}
+    speeds = [0.0, 0.0, rounding, -rounding, 0.0]
+    bodies = {f"b{k}": dr.Body(dr.Disc(radius=0.5), mass=1.0, x=(1.0 * k, 0.0), v=(speeds[k], 0.0)) for k in range(5)}
     bodies["cue"] = dr.Body(dr.Disc(radius=0.5), mass=1.0, x=(-3.0, 0.0), v=(2.0, 0.0))
     world, state = dr.scene(bodies, restitution=1.0)
     end = dr.rollout(world, state, dt=1 / 60, steps=120).state
     assert_allclose(end.v[-1], np.eye(6)[4][:, None] * [2.0, 0.0], atol=1e-9)
     assert_allclose(end.x[-1, :, 0], [0.0, 1.0, 2.0, 3.0, 6.0, -1.0], atol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("tilt", [2e-4, 1e-3])
+def test_a_cube_tilted_by_little_falls_flat(tilt, dtype):
+    """About its lower edge, faster and faster at 3 g / 8 h, within the first step of 1/240 s or the second."""
+    h, half = 0.05, 0.5 * tilt
+    pose = dict(x=(0.0, 0.0, h * (np.cos(tilt) + np.sin(tilt))), q=(np.cos(half), 0.0, np.sin(half), 0.0))
+    cube = dr.Body(dr.Box(half=(h, h, h)), mass=0.4, **pose)
+    ground = dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))
+    world, state = dr.scene({"cube": cube, "ground": ground}, gravity=(0.0, 0.0, -G), friction=1.0)
+    world, state = jax.tree.map(lambda leaf: leaf.astype(dtype), (world, state))
+    path = dr.rollout(world, state, dt=1 / 240, steps=4).state
+    angle = 2.0 * path.q[:, 0, 2]
+    assert_allclose(angle[1], max(tilt - 0.5 * 3 * G / (8 * h) / 240**2, 0.0), atol=1e-6)
+    assert_allclose(angle[2:], 0.0, atol=1e-6)
+    assert_allclose([path.v[2:], path.w[2:]], 0.0, atol=1e-5)
 
 
 def tipping(mu, w, inertia):

@@ -9,13 +9,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.known import Known, beside, loads, reversing
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
 from diffrigid.contact.order import over_islands
-from diffrigid.contact.resting import Law, Strikes, solve_impulses
+from diffrigid.contact.resting import Law, Strikes, barely, solve_impulses
 from diffrigid.contact.rolling import rolling_stops, with_rows
 from diffrigid.contact.sides import side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
@@ -90,7 +90,10 @@ def _solved(
         stopped = rolling_stops
     if known is not None:
         strikes, law = beside(mobility, strikes, law, known)
-    P = solve_impulses(strikes, law, mobility, count, world.contact.rest_speed)
+    guess = barely(strikes, world.contact.rest_speed)
+    if known is not None:  # what rests has next to no gaps, so that it is displaced back by what undid its loads
+        guess = jnp.where(kick > 0, guess, -known.P)
+    P = solve_impulses(strikes, law, mobility, count, world.contact.rest_speed, lax.stop_gradient(guess))
     return strikes, law, held_for, P, stopped(mobility, strikes, P, law, held_for)
 
 

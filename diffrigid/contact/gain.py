@@ -24,7 +24,7 @@ from diffrigid.numerics import any_world, dot
 from diffrigid.pytree import replace
 
 
-def solve_without_gain(cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
+def solve_without_gain(cone: Cone, v_rel: Array, guess: Array, arms: Arms, mobility: Mobility) -> Array:
     """Impulses of contacts that share bodies, (C, D, *batch) [N s]; arguments as of `solve_together`.
 
     Differentiable as these are, but where the bound on energy begins to act.
@@ -43,7 +43,7 @@ def solve_without_gain(cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility)
 
     def one(needed: Array, rough: Array) -> tuple[Array, tuple[Array, Array]]:
         spin = None if cone.spin is None else rough * cone.spin
-        P = solve_together(needed, replace(cone, mu=rough * cone.mu, spin=spin), v_rel, arms, mobility)
+        P = solve_together(needed, replace(cone, mu=rough * cone.mu, spin=spin), v_rel, guess, arms, mobility)
         gains = lax.cond(any_bounce & (rough > 0), gaining, lambda _: jnp.asarray(False), P)
         return gains, (P, gains)
 

@@ -34,8 +34,9 @@ class Known:
         """Whether some friction reverses in a world, (*batch) bool."""
         return (self.early != 0).any((0, 1))
 
-    def opened(self, gap: Array) -> Array:
-        """Whether a gap (C, *batch) of a world is open where a contact carries a load, (*batch) bool."""
+    def opened(self, strikes: Strikes) -> Array:
+        """Whether a gap of a world is open, by more than rounding, where a contact carries a load, (*batch) bool."""
+        gap = strikes.gap - strikes.slack
         turning_rows = len(self.P) - len(gap)
         P = jnp.concatenate([self.P[:turning_rows], self.P[2 * turning_rows :]]) if turning_rows else self.P
         return ((gap > 0) & (P != 0).any(1)).any(0)

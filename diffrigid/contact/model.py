@@ -148,10 +148,12 @@ def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) 
     (anchors, resting, known, *_), (impact, reverse, push) = now, (phase == kind for kind in (IMPACT, REVERSE, PUSH))
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting)
+    opened = jnp.zeros(dt.shape, bool) if known is None else push & known.opened(strikes)
+    strikes = replace(strikes, gap=_closed(strikes, opened))
     strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
     if known is not None:
         skips = reverse & ~known.reverses()
-        unused = skips | (push & ~known.opened(strikes.gap))
+        unused = skips | (push & ~opened)
         strikes = replace(strikes, active=strikes.active & ~skips[None])
 
     def strike(anchors, known):
@@ -169,6 +171,12 @@ def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) 
     any_now = any_world(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
     return Progress(anchors, resting, known, any_now, any_world(resting | strikes.rests))
+
+
+def _closed(strikes: Strikes, opened: Array) -> Array:
+    """Gaps (C, *batch) [m]: what rounding opened is closed, unless a world is `opened`, but moves as any other."""
+    closed = (strikes.gap > 0) & (strikes.gap <= strikes.slack) & ~opened[None]
+    return jnp.where(closed, strikes.gap - lax.stop_gradient(strikes.gap), strikes.gap)
 
 
 def _demanded(

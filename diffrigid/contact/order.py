@@ -72,7 +72,9 @@ def in_order(
         return links.of_bodies(jnp.min, jnp.where(impacts, s, jnp.inf), jnp.inf)
 
     first = first_of(fast)
-    now, held = jnp.abs(lax.stop_gradient(s - links.least(first, jnp.inf))) <= tie, jnp.broadcast_to(at_end, s.shape)
+    # What closes by rounding at the time of an impact takes no part: between touching balls it is passed on.
+    now = fast & (jnp.abs(lax.stop_gradient(s - links.least(first, jnp.inf))) <= tie)
+    held = jnp.broadcast_to(at_end, s.shape)
     joins = jnp.zeros_like(now)
     if bounces is not None:
 

@@ -10,7 +10,7 @@ from diffrigid.contact.gain import solve_without_gain
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sides import at_colliders
-from diffrigid.numerics import any_world, safe_sqrt
+from diffrigid.numerics import any_world, safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static
 
 
@@ -21,6 +21,7 @@ class Strikes:
     active: Array = array("C")  # (C, *batch) bool: touching at s
     s: Array = array("C")  # (C, *batch) [s]
     gap: Array = array("C")  # [m]
+    slack: Array = array("C")  # [m] up to which a gap may be rounding
     normal: Array = array("C", "D")  # from b to a
     arm_a: Array = array("C", "D")  # [m] contact point from the centre of mass of a, world axes
     arm_b: Array = array("C", "D")
@@ -51,7 +52,9 @@ class Law(NamedTuple):
     most: Array | None  # [N s] of the normal impulse, to both sides; infinite: it pushes, without bound. None: all do
 
 
-def solve_impulses(strikes: Strikes, law: Law, mobility: Mobility, count: Array, rest_speed: Array) -> Array:
+def solve_impulses(
+    strikes: Strikes, law: Law, mobility: Mobility, count: Array, rest_speed: Array, guess: Array
+) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
     A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `together.py`,
@@ -60,6 +63,7 @@ def solve_impulses(strikes: Strikes, law: Law, mobility: Mobility, count: Array,
     Args:
         count: (N, *batch) number of active contacts of each body.
         rest_speed: (*batch) [m/s] what is slow in these worlds.
+        guess: (C, D, *batch) [N s] impulses that a solution of many may be near to.
     """
     target, mu, most = law
     if mobility.matrix is None and are_alone(strikes.a, strikes.b, len(count)):
@@ -71,16 +75,29 @@ def solve_impulses(strikes: Strikes, law: Law, mobility: Mobility, count: Array,
     alone = lax.cond(
         any_world(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu
     )
-    scale = lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
     cone = Cone(
-        on=shared.astype(others.dtype), sharing=jnp.maximum(others, 1.0), scale=scale, normal=strikes.normal,
+        on=shared.astype(others.dtype), sharing=jnp.maximum(others, 1.0), scale=_scale(strikes), normal=strikes.normal,
         target=target, mu=mu, most=most, spin=strikes.spin, rest_speed=rest_speed,
     )  # fmt: skip
     arms = Arms(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, mid_a=strikes.mid_a, mid_b=strikes.mid_b, turn=strikes.turn,
         jac=strikes.jac, mid_jac=strikes.mid_jac, spin=strikes.spin, a=strikes.a, b=strikes.b,
     )  # fmt: skip
-    return alone + solve_without_gain(cone, strikes.v_rel, arms, mobility)
+    return alone + solve_without_gain(cone, strikes.v_rel, guess, arms, mobility)
+
+
+def barely(strikes: Strikes, rest_speed: Array) -> Array:
+    """Impulses of contacts that hardly push, (C, D, *batch) [N s]: to change their velocities by `rest_speed`.
+
+    Newton's method takes what pushes to stick. From nothing it would find out that a pile does floor by floor.
+    """
+    on = strikes.active.astype(strikes.s.dtype)
+    return (on * safe_divide(rest_speed[None], _scale(strikes)))[:, None] * lax.stop_gradient(strikes.normal)
+
+
+def _scale(strikes: Strikes) -> Array:
+    """Size of the effective matrices, (C, *batch) [1/kg]."""
+    return lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
 
 
 def are_alone(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> bool:

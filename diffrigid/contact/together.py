@@ -32,7 +32,7 @@ from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
 from diffrigid.numerics import FOUND, any_world, dot, identity, matvec, norm, safe_divide, solve_regular
-from diffrigid.pytree import array, pytree, replace
+from diffrigid.pytree import array, pytree, replace, static
 
 ROUNDS = 40  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
@@ -41,6 +41,9 @@ PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not 
 SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little
 LITTLE = 0.9  # of the error before: a step that leaves more gained little
 PATIENCE = 3  # rounds that do not halve a small error: then it is rounding
+# e as a power of the spacing of numbers. A step leaves an error of relative size e / least eigenvalue of W / k, which
+# for a tower is 1e-4 and less, and one of rounding / e; with the inverse written out, of rounding / e^2.
+STEPPING, REFINING = 0.55, 0.4
 REFINEMENTS = 8  # of the linear system of the derivative
 
 
@@ -56,6 +59,7 @@ class Slope:
     mu: Array = array("C")
     free: Any = array("K", default=None)  # rows that turn: 1 where along the normal they are within their bounds
     spin: Any = array("K", default=None)  # [m] else how that follows the load
+    small: float = static(default=0.0)  # e
 
 
 def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
@@ -64,7 +68,8 @@ def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) 
     return P - (y - cone.target[:, None] * cone.normal) / cone.scale[:, None]
 
 
-def _slope(cone: Cone, z: Array) -> Slope:
+def _slope(cone: Cone, z: Array, power: float) -> Slope:
+    """D at z, with e the spacing of numbers to a `power`."""
     z_n, z_t = split(cone.normal, z)
     size, bound = jax.vmap(norm)(z_t), cone.mu * jnp.maximum(z_n, 0.0)
     if cone.spin is not None:
@@ -72,7 +77,8 @@ def _slope(cone: Cone, z: Array) -> Slope:
     follows = z_n > 0 if cone.most is None else jnp.where(jnp.isinf(cone.most), z_n > 0, jnp.abs(z_n) < cone.most)
     on, slides = jnp.where(follows, cone.on, 0.0), (size >= bound).astype(z.dtype)
     bends, along = jnp.where(size < bound, 1.0, safe_divide(bound, size)), z_t / jnp.where(size > 0, size, 1.0)[:, None]
-    slope = Slope(on=on, slides=slides, bends=bends, normal=cone.normal, along=along, mu=cone.mu)
+    small = float(jnp.finfo(z.dtype).eps) ** power
+    slope = Slope(on=on, slides=slides, bends=bends, normal=cone.normal, along=along, mu=cone.mu, small=small)
     if cone.spin is None:
         return slope
     load, about = jnp.maximum(z_n[: len(cone.spin)], 0.0), turning(cone.spin, z_n)
@@ -92,29 +98,30 @@ def _sloped(slope: Slope, r: Array) -> Array:
     return slope.on[:, None] * (r_n[:, None] * slope.normal + slope.bends[:, None] * r_t + along[:, None] * slope.along)
 
 
-def _unsloped(slope: Slope, e: float, r: Array) -> tuple[Array, Array]:
+def _unsloped(slope: Slope, r: Array) -> tuple[Array, Array]:
     """B^-1 r and B^-1 D r, by components: normal, along the sliding, and across both."""
     r_n, r_t = split(slope.normal, r)
     r_along = slope.slides * jax.vmap(dot)(slope.along, r_t)
     r_across = r_t - r_along[:, None] * slope.along
-    on, kept = slope.on, 1.0 - slope.on * (1.0 - e)
+    e, on = slope.small, slope.on
+    kept = 1.0 - on * (1.0 - e)
     rest = 1.0 - on * (1.0 - e) * slope.bends  # e where it sticks
     if slope.spin is not None:
         kept = put(slope.spin, kept, 1.0 - turning(slope.spin, on) * slope.free * (1.0 - e))
-        return _unsloped_rows(slope, e, r_n / kept, r_along, r_across, rest)
+        return _unsloped_rows(slope, r_n / kept, r_along, r_across, rest)
     drag = slope.slides * slope.mu * r_n / kept * on
     B_r = (r_n / kept)[:, None] * slope.normal + r_across / rest[:, None]
     BD_r = (on * r_n / kept)[:, None] * slope.normal + (on * slope.bends / rest)[:, None] * r_across
     return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
 
 
-def _unsloped_rows(slope: Slope, e: float, x_n: Array, r_along: Array, r_across: Array, rest: Array):
+def _unsloped_rows(slope: Slope, x_n: Array, r_along: Array, r_across: Array, rest: Array):
     """The same where rows turn: what loads them is the first of the results, at their contacts.
 
     Args:
         x_n: normal components of B^-1 r but for what rows get from their load.
     """
-    on, count = slope.on, len(slope.spin)
+    e, on, count = slope.small, slope.on, len(slope.spin)
     load = put(slope.spin, x_n, (on * x_n)[:count])
     more = put(slope.spin, jnp.zeros_like(x_n), slope.spin * turning(slope.spin, on * load))
     own = put(slope.spin, on, turning(slope.spin, on) * slope.free) * x_n
@@ -124,14 +131,9 @@ def _unsloped_rows(slope: Slope, e: float, x_n: Array, r_along: Array, r_across:
     return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
 
 
-def _small(dtype: Any) -> float:
-    """e: an error of relative size (rounding / e^2 + e / least eigenvalue of W / k) is left by each step."""
-    return float(jnp.finfo(dtype).eps) ** 0.4
-
-
 def _answer(slope: Slope, cone: Cone) -> Callable[[Array], Array]:
     """B^-1 D / k: impulses for relative velocities, (C, D, *batch)."""
-    return lambda y: _unsloped(slope, _small(y.dtype), y / cone.scale[:, None])[1]
+    return lambda y: _unsloped(slope, y / cone.scale[:, None])[1]
 
 
 def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
@@ -141,7 +143,7 @@ def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
 
 def _newton_step(r: Array, solved: Callable, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
     """dP of (B + D W / k) dP = r, (C, D, *batch)."""
-    direct = _unsloped(slope, _small(r.dtype), r)[0]
+    direct = _unsloped(slope, r)[0]
     return direct - _pushed_back(slope, cone, arms, solved(twists(direct, arms, mobility)))
 
 
@@ -159,23 +161,24 @@ class Search(NamedTuple):
 
 
 @jax.custom_jvp
-def solve_together(shared: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
+def solve_together(shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: Arms, mobility: Mobility) -> Array:
     """Impulses of all contacts that take part, (C, D, *batch) [N s]; zero for the others.
 
     Args:
         shared: bool: there is such a contact in some world of the batch.
         v_rel: (C, D, *batch) [m/s] before the impulses.
+        guess: (C, D, *batch) [N s] impulses to begin with.
     """
 
-    def solved(nothing):
-        P = _smoothed(nothing, cone, v_rel, arms, mobility)
+    def solved(guess):
+        P = _smoothed(guess, cone, v_rel, arms, mobility)
         z, r = _missing(P, cone, v_rel, arms, mobility)
         error = _speed(cone, r)
         start = Search(0, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
         again = functools.partial(_again, given=(cone, v_rel, arms, mobility))
         return lax.while_loop(lambda now: (now.count < ROUNDS) & any_world(_lacks(cone, now)), again, start).best
 
-    return lax.cond(shared, solved, lambda nothing: nothing, jnp.zeros_like(v_rel))
+    return lax.cond(shared, solved, jnp.zeros_like, guess)
 
 
 def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
@@ -185,7 +188,7 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
     """
     cone, v_rel, arms, mobility = given
-    slope = _slope(cone, now.z)
+    slope = _slope(cone, now.z, STEPPING)
     matrix = bodies_matrix(_answer(slope, cone), arms, mobility)
     dP = _newton_step(now.r, lambda u: solve_regular(matrix, u[:, None])[:, 0], slope, cone, arms, mobility)
     P, since = allowed(cone, now.P + dP), now.since
@@ -262,14 +265,15 @@ def _circles(cone: Cone, now: Search) -> Array:
 @solve_together.defjvp
 def _solve_together_jvp(primals, tangents):
     """(1 - D + D W / k) dP = what the parameters change of `allowed(z)` at fixed P."""
-    shared, cone, v_rel, arms, mobility = primals
+    shared, cone, v_rel, _, arms, mobility = primals
     P = checkpoint_name(solve_together(*primals), FOUND)
 
     def projected(cone, v_rel, arms, mobility):
         return allowed(cone, _excess(cone, P, v_rel, arms, mobility))
 
-    change = jax.jvp(projected, primals[1:], tangents[1:])[1]
-    slope = lax.stop_gradient(_slope(cone, _excess(cone, P, v_rel, arms, mobility)))
+    of, by = ((cone, v_rel, arms, mobility) for _, cone, v_rel, _, arms, mobility in (primals, tangents))
+    change = jax.jvp(projected, of, by)[1]
+    slope = lax.stop_gradient(_slope(cone, _excess(cone, P, v_rel, arms, mobility), REFINING))
     fixed = lax.stop_gradient((slope, cone, arms, mobility))
 
     def linear(x):
