@@ -36,7 +36,7 @@ class Known:
 
     def opened(self, strikes: Strikes) -> Array:
         """Whether a gap of a world is open, by more than rounding, where a contact carries a load, (*batch) bool."""
-        gap = strikes.gap - strikes.slack
+        gap = strikes.gap - strikes.rounding
         turning_rows = len(self.P) - len(gap)
         P = jnp.concatenate([self.P[:turning_rows], self.P[2 * turning_rows :]]) if turning_rows else self.P
         return ((gap > 0) & (P != 0).any(1)).any(0)

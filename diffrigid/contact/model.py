@@ -175,7 +175,7 @@ def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) 
 
 def _closed(strikes: Strikes, opened: Array) -> Array:
     """Gaps (C, *batch) [m]: what rounding opened is closed, unless a world is `opened`, but moves as any other."""
-    closed = (strikes.gap > 0) & (strikes.gap <= strikes.slack) & ~opened[None]
+    closed = (strikes.gap > 0) & (strikes.gap <= strikes.rounding) & ~opened[None]
     return jnp.where(closed, strikes.gap - lax.stop_gradient(strikes.gap), strikes.gap)
 
 

@@ -72,7 +72,7 @@ def in_order(
         return links.of_bodies(jnp.min, jnp.where(impacts, s, jnp.inf), jnp.inf)
 
     first = first_of(fast)
-    # What closes by rounding at the time of an impact takes no part: between touching balls it is passed on.
+    # What closes slowly at the time of an impact, as by rounding, takes no part: touching balls pass it on.
     now = fast & (jnp.abs(lax.stop_gradient(s - links.least(first, jnp.inf))) <= tie)
     held = jnp.broadcast_to(at_end, s.shape)
     joins = jnp.zeros_like(now)

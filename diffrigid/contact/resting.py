@@ -21,7 +21,7 @@ class Strikes:
     active: Array = array("C")  # (C, *batch) bool: touching at s
     s: Array = array("C")  # (C, *batch) [s]
     gap: Array = array("C")  # [m]
-    slack: Array = array("C")  # [m] up to which a gap may be rounding
+    rounding: Array = array("C")  # [m] up to which a gap may be open by it
     normal: Array = array("C", "D")  # from b to a
     arm_a: Array = array("C", "D")  # [m] contact point from the centre of mass of a, world axes
     arm_b: Array = array("C", "D")
@@ -92,7 +92,7 @@ def barely(strikes: Strikes, rest_speed: Array) -> Array:
     Newton's method takes what pushes to stick. From nothing it would find out that a pile does floor by floor.
     """
     on = strikes.active.astype(strikes.s.dtype)
-    return (on * safe_divide(rest_speed[None], _scale(strikes)))[:, None] * lax.stop_gradient(strikes.normal)
+    return (on * safe_divide(rest_speed[None], _scale(strikes)))[:, None] * strikes.normal
 
 
 def _scale(strikes: Strikes) -> Array:

@@ -168,7 +168,7 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
         pull = lax.stop_gradient(_second(gap, s))
     touches = ~meeting.held | meeting.rests[0] | (open_by <= jnp.sqrt(jnp.finfo(s.dtype).eps))
     return Strikes(
-        active=meeting.hit & touches, s=s, gap=open_by, slack=0.0 * s, normal=first, arm_a=none, arm_b=none,
+        active=meeting.hit & touches, s=s, gap=open_by, rounding=0.0 * s, normal=first, arm_a=none, arm_b=none,
         K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,
         pull=pull[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now,
         held=meeting.held, jac=jac, mid_jac=mid_jac,
