@@ -210,10 +210,15 @@ def _with_tangents_jvp(primals, tangents):
     return primals[0], tangents[0]
 
 
+def _least(like: Array) -> float:
+    """Numbers below it have lost digits, and may or may not be taken as zero: then 0 * inf is NaN, as at zero."""
+    return float(jnp.finfo(like.dtype).tiny)
+
+
 @jax.jit
 def safe_sqrt(x: Array) -> Array:
-    """Square root, 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite)."""
-    positive = x > 0
+    """Square root, 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite), or next to it."""
+    positive = x >= _least(x)
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
@@ -250,8 +255,8 @@ _HALF_PI = {
 
 @jax.jit
 def safe_divide(a: Array, b: Array) -> Array:
-    """a / b, and 0 with zero derivative where b == 0 (0 / 0 in both modes)."""
-    nonzero = b != 0
+    """a / b, and 0 with zero derivative where b == 0 (0 / 0 in both modes), or next to it."""
+    nonzero = jnp.abs(b) >= _least(b)
     return jnp.where(nonzero, a / jnp.where(nonzero, b, 1.0), 0.0)
 
 
@@ -263,28 +268,38 @@ def norm(a: Array) -> Array:
 
 @jax.jit
 def normalise(a: Array, fallback: Array | None = None) -> Array:
-    """Unit vector along `a`; `fallback` (default: the zero vector) where a == 0, with zero derivative."""
+    """Unit vector along `a`; `fallback` (default: the zero vector) where |a|^2 is 0, with zero derivative."""
     square = dot(a, a)
-    nonzero = square > 0
+    nonzero = square >= _least(square)
     unit = a / jnp.sqrt(jnp.where(nonzero, square, 1.0))[None]
     return jnp.where(nonzero[None], unit, jnp.zeros_like(a) if fallback is None else fallback)
 
 
 def solve_regular(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, for regular matrices (R, R, *batch), (R, M, *batch) -> (R, M, *batch), no derivative.
+    """x of matrix x = right, for regular matrices, (R, R, *batch), (R, *batch) -> (R, *batch).
 
-    Finite where a matrix is singular, but no solution.
+    Linear in `right`, also for transposition; without derivative by the matrix. Finite where a matrix is singular,
+    but no solution.
     """
-    matrix, right = lax.stop_gradient((matrix, right))
-    if len(matrix) <= TINY and right.shape[1] == 1:
-        return _written_out(matrix, right)
+    matrix = lax.stop_gradient(matrix)
+
+    def by(matrix: Array) -> Callable[[Any, Array], Array]:
+        return lambda _, u: _eliminated(matrix, u)
+
+    back = by(jnp.swapaxes(matrix, 0, 1))
+    return lax.custom_linear_solve(functools.partial(matvec, matrix), right, by(matrix), transpose_solve=back)
+
+
+def _eliminated(matrix: Array, right: Array) -> Array:
+    system = jnp.concatenate([matrix, right[:, None]], axis=1)
+    if len(matrix) <= TINY:
+        return _written_out(system)
     if len(matrix) <= SMALL:
-        return _gauss_jordan(matrix, right)
+        return _gauss_jordan(system)
     # What elimination makes of the right side beside the matrix needs no permutation.
-    system = jnp.moveaxis(jnp.concatenate([matrix, right], axis=1), (0, 1), (-2, -1))
-    upper, reduced = jnp.split(lax.linalg.lu(system)[0], [len(matrix)], axis=-1)
-    x = lax.linalg.triangular_solve(upper, reduced, left_side=True)
-    return jnp.moveaxis(jnp.where(jnp.isfinite(x), x, 0.0), (-2, -1), (0, 1))
+    upper, reduced = jnp.split(lax.linalg.lu(jnp.moveaxis(system, (0, 1), (-2, -1)))[0], [len(matrix)], axis=-1)
+    x = lax.linalg.triangular_solve(upper, reduced, left_side=True)[..., 0]
+    return jnp.moveaxis(jnp.where(jnp.isfinite(x), x, 0.0), -1, 0)
 
 
 def matvec(matrix: Array, u: Array) -> Array:
@@ -299,13 +314,13 @@ def identity(like: Array) -> Array:
     return jnp.eye(size, dtype=like.dtype).reshape(size, size, *[1] * len(batch)) + jnp.zeros_like(like)
 
 
-def _written_out(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, (R, R, *batch), (R, 1, *batch) -> (R, 1, *batch), without a choice of pivots.
+def _written_out(system: Array) -> Array:
+    """x of a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch), without a choice of pivots.
 
     No choice is needed where the matrix is the product of a block-diagonal one and one with a positive definite
     symmetric part, as that of a body is but for strong friction. A direction whose pivot is 0 is left out.
     """
-    system, eliminated = jnp.concatenate([matrix, right], axis=1), []
+    eliminated = []
     while len(system):
         pivot = system[0, 0]
         eliminated.append(system[0, 1:] * safe_divide(jnp.ones_like(pivot), pivot)[None])
@@ -313,17 +328,17 @@ def _written_out(matrix: Array, right: Array) -> Array:
     x: list[Array] = []
     for row in reversed(eliminated):
         x.insert(0, functools.reduce(jnp.subtract, [a * b for a, b in zip(row[:-1], x, strict=True)], row[-1]))
-    return jnp.stack(x)[:, None]
+    return jnp.stack(x)
 
 
-def _gauss_jordan(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, (R, R, *batch), (R, M, *batch) -> (R, M, *batch).
+def _gauss_jordan(system: Array) -> Array:
+    """x of a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch).
 
     Pivots are chosen by column in each matrix of the batch; rows stay where they are. A direction whose pivot is 0 is
     left out.
     """
-    count = matrix.shape[0]
-    index = lax.broadcasted_iota(np.int32, (count, *matrix.shape[2:]), 0)
+    count = system.shape[0]
+    index = lax.broadcasted_iota(np.int32, (count, *system.shape[2:]), 0)
 
     def eliminate(k, carry):
         system, order = carry
@@ -336,10 +351,8 @@ def _gauss_jordan(matrix: Array, right: Array) -> Array:
         system = jnp.where(chosen[:, None], row[None], system - column[:, None] * row[None])
         return system, jnp.where(chosen, k, order)
 
-    start = jnp.concatenate([matrix, right], axis=1), jnp.full_like(index, count)
-    system, order = lax.fori_loop(0, count, eliminate, start)
-    x = system[:, count:]
-    return jnp.where((order[None] == index[:, None])[:, :, None], x[None], 0.0).sum(1)
+    system, order = lax.fori_loop(0, count, eliminate, (system, jnp.full_like(index, count)))
+    return jnp.where(order[None] == index[:, None], system[None, :, count], 0.0).sum(1)
 
 
 def softplus(x: Array, width: Array) -> Array:
@@ -362,7 +375,8 @@ def implicit_root(s: Array, error: Array, slope: Array) -> Array:
         slope: d(error)/ds at s. Where it is zero (grazing: the root is about to vanish) the derivative is
             cut to zero instead of infinite.
 
-    Forward mode evaluates nothing but s, so a rollout without derivatives does not pay for this.
+    Without derivatives nothing is evaluated but s, so a rollout does not pay for this. A second derivative needs the
+    equation itself, where s moves, and not what is left of it here: it raises NotImplementedError.
     """
     del error, slope
     return s
@@ -370,5 +384,20 @@ def implicit_root(s: Array, error: Array, slope: Array) -> Array:
 
 @implicit_root.defjvp
 def _implicit_root_jvp(primals, tangents):
-    s, _, slope = primals
-    return s, -safe_divide(tangents[1], slope)
+    s, error, slope = primals
+    return s, -safe_divide(tangents[1], _once(slope, error))
+
+
+@jax.custom_jvp
+def _once(slope: Array, error: Array) -> Array:
+    """The slope, for a first derivative only."""
+    del error
+    return slope
+
+
+@_once.defjvp
+def _once_jvp(primals, tangents):
+    raise NotImplementedError(
+        "second derivatives (jax.hessian, jax.jvp of jax.grad) through the time of an impact are not available: "
+        "take differences of first ones"
+    )

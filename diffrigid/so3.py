@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import any_world, components, cos_sin, dot, safe_sqrt
+from diffrigid.numerics import any_world, components, cos_sin, dot, fold, safe_sqrt
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
@@ -135,9 +135,10 @@ def _matrix(q: Array) -> list[list[Array]]:
 
 def inverse_inertia(inertia: Array) -> Array:
     """Inverse of a symmetric (3, 3, *batch) matrix by cofactors, [1/(kg m^2)]."""
-    a, b, c = inertia
+    trace = lax.stop_gradient(inertia[0, 0] + inertia[1, 1] + inertia[2, 2])[None, None]
+    a, b, c = inertia / trace  # of any unit: the square of a determinant may underflow
     bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
-    return jnp.stack([bc, ca, ab], axis=1) / dot(a, bc)[None, None]
+    return jnp.stack([bc, ca, ab], axis=1) / dot(a, bc)[None, None] / trace
 
 
 def spin(inertia: Array, q: Array, w: Array) -> Array:
@@ -191,13 +192,13 @@ def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
         return _whole_series(inverse, q, L, tau)
     l = unrotate(q, L)
     w = matrix_product(inverse, l)
-    twist, size = cross(l, w), dot(l, l) * dot(w, w)
 
     def first(inverse, q, L):
         del inverse, q, L
         return jnp.concatenate([w[None], jnp.zeros((SERIES_ORDER - 1, *w.shape), w.dtype)])
 
-    wanders = dot(twist, twist) > (16.0 * jnp.finfo(w.dtype).eps) ** 2 * size
+    most, of_l, of_w = (fold(jnp.maximum, jnp.abs(a), 0) for a in (cross(l, w), l, w))
+    wanders = most > 16.0 * jnp.finfo(w.dtype).eps * of_l * of_w
     return lax.cond(any_world(wanders), partial(_whole_series, tau=None), first, inverse, q, L)
 
 

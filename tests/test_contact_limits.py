@@ -237,6 +237,29 @@ def test_law_without_friction_is_smooth_where_the_target_makes_energy():
     assert all(np.isfinite(slope).all() for slope in slopes(K, n, v, target, jnp.zeros(())))
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("mass", "speed"), [(1e-9, 1e-7), (1.0, 1e-9), (1e12, 1.0)])
+def test_law_is_the_same_in_any_unit(dim, mass, speed):
+    """In float32, whose range squares of K [1/kg] and of energies would leave: impulses, and slopes by all arguments."""
+    K = np.array([[3.0, 0.4, -0.7], [0.4, 2.0, 0.5], [-0.7, 0.5, 2.5]])[:dim, :dim]
+    n, mu = np.array([0.6, 0.8, 0.0])[:dim], 0.3
+    for slip, closing in ((0.2, -1.0), (2.0, -1.0), (1e-3, 1.0)):  # sticks, slides, parts
+        v = closing * n + slip * np.array([0.8, -0.6, 0.5])[:dim]
+
+        def slopes(dtype, mass, speed, K=K, v=v):
+            arguments = [jnp.asarray(a, dtype) for a in (K / mass, n, v * speed, 0.5 * speed, mu)]
+            return contact_law(*arguments), *jax.jacrev(contact_law, (0, 1, 2, 3, 4))(*arguments)
+
+        P = mass * speed
+        for unit, one, other in zip(
+            (P, mass * P, P, mass, mass, P),
+            slopes(jnp.float64, 1.0, 1.0),
+            slopes(jnp.float32, mass, speed),
+            strict=True,
+        ):
+            assert_allclose(np.asarray(other, np.float64) / unit, one, rtol=1e-5, atol=1e-5 * np.abs(one).max())
+
+
 def test_a_contact_that_is_off_has_no_derivative():
     """In a list of contacts most are far apart, where the law overflows in float32: 0, and not 0 * inf."""
     far = {"K": jnp.diag(jnp.array([2.0, 9.0]))[None], "n": jnp.array([[0.6, 0.8]]), "v": jnp.full((1, 2), -1e25)}
@@ -244,6 +267,20 @@ def test_a_contact_that_is_off_has_no_derivative():
     P, back = jax.vjp(lambda far: impulses(jnp.array([False]), **far), far)
     assert not P.any()
     assert all(not leaf.any() for leaf in jax.tree.leaves(back(jnp.ones_like(P))))
+
+
+def test_second_derivatives_through_an_impact_are_an_error():
+    """Not numbers that leave out how the time of the impact curves; those of a free body are right."""
+    ball, floor = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0)), dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+
+    def fall(g, bodies):
+        world, state = dr.scene(bodies, gravity=jnp.stack([jnp.zeros_like(g), -g]))
+        return dr.step(world, state, 0.1).x[0, 1] ** 2
+
+    free = jax.hessian(lambda g: fall(g, {"ball": ball}))(jnp.asarray(10.0))
+    assert_allclose(free, 2.0 * (0.5 * 0.1**2) ** 2)
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        jax.hessian(lambda g: fall(g, {"ball": ball, "floor": floor}))(jnp.asarray(10.0))
 
 
 def test_friction_of_rounding_has_finite_slopes():

@@ -11,7 +11,7 @@ from jax import Array, lax
 
 from diffrigid import so3
 from diffrigid.collide.contacts import Contacts
-from diffrigid.numerics import dot, normalise, rows, safe_divide, unit_vector
+from diffrigid.numerics import dot, norm, normalise, rows, unit_vector
 from diffrigid.shapes import Capsule, edge_apexes, edges, radius
 
 FAR = 1e6  # [m] gap of a crossing that does not exist
@@ -87,14 +87,15 @@ def crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
     They may if the faces beside both edges fall away from the normal (arcs that cross in the Gauss map).
     Source: Ericson, Real-Time Collision Detection, 5.1.9; Gregorius, The separating axis test, GDC 2013.
     """
-    aa, bb, ab = dot(a.along, a.along), dot(b.along, b.along), dot(a.along, b.along)
-    between = a.start - b.start
-    ra, rb = dot(a.along, between), dot(b.along, between)
-    det = aa * bb - ab * ab
-    share_a, share_b = safe_divide(ab * rb - bb * ra, det), safe_divide(aa * rb - ab * ra, det)
-    within = (det > PARALLEL**2 * aa * bb) & (share_a > 0) & (share_a < 1) & (share_b > 0) & (share_b < 1)
-    on_a, on_b = a.start + share_a[None] * a.along, b.start + share_b[None] * b.along
-    n = normalise(so3.cross(a.along, b.along), fallback=unit_vector(between, -1))
+    length_a, length_b, u_a, u_b = norm(a.along), norm(b.along), normalise(a.along), normalise(b.along)
+    between, cosine = a.start - b.start, dot(u_a, u_b)
+    ra, rb, det = dot(u_a, between), dot(u_b, between), 1.0 - cosine * cosine
+    cross = det > PARALLEL**2
+    det = jnp.where(cross, det, 1.0)
+    s_a, s_b = (cosine * rb - ra) / det, (rb - cosine * ra) / det  # [m] from the starts
+    within = cross & (s_a > 0) & (s_a < length_a) & (s_b > 0) & (s_b < length_b)
+    on_a, on_b = a.start + s_a[None] * u_a, b.start + s_b[None] * u_b
+    n = normalise(so3.cross(u_a, u_b), fallback=unit_vector(between, -1))
     sides = dot(n, a.left), dot(n, a.right), -dot(n, b.left), -dot(n, b.right)  # [m] all on one side of zero
     behind = sides[0] + sides[1] + sides[2] + sides[3]
     towards = jnp.where(jnp.abs(behind) > slack, behind, dot(n, on_a - on_b))  # two capsules have no faces

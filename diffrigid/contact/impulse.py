@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from diffrigid.contact.levers import Levers
 from diffrigid.contact.sides import Placed
@@ -85,36 +85,43 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
 
     Differentiable except at the switches: separating to closing, stick to slip.
     """
-    basis, axes = _contact_frame(n), range(n.shape[0])
-    moved = [matvec(K, e) for e in basis]
-    k = [[dot(basis[i], moved[j]) for j in axes] for i in axes]
+    basis, k, effective_mass = _in_contact_frame(K, n)
+    axes = range(len(basis))
     v_n, *v_t = [dot(e, v) for e in basis]
-    gamma = jnp.maximum(safe_divide(target - v_n, k[0][0]), 0.0)
+    gamma = jnp.maximum(target - v_n, 0.0)
     after = [v_i + gamma * k_in for v_i, (k_in, *_) in zip([v_n, *v_t], k, strict=True)]
     Q = _friction_impulse(k, gamma, after[1:], mu)
     gained = sum(Q[i] * k[i][j] * Q[j] for i in axes for j in axes)
     kappa = within_energy(0.5 * gamma * (v_n + target), sum(Q[i] * after[i] for i in axes), gained)
     P = [gamma + kappa * Q[0], *(kappa * Q_t for Q_t in Q[1:])]
-    return sum(P[i][None] * basis[i] for i in axes)
+    return sum((effective_mass * P[i])[None] * basis[i] for i in axes)
 
 
-def _contact_frame(n: Array) -> list[Array]:
-    """n and its unit tangents."""
-    return [n, perp(n)] if n.shape[0] == 2 else [n, *tangents(n)]
+def _in_contact_frame(K: Array, n: Array) -> tuple[list[Array], list[list[Array]], Array]:
+    """n and its unit tangents; K along them, over its normal component; and the inverse of that, the effective mass.
+
+    Impulses are velocities [m/s] then, until they are multiplied by the effective mass: products of components of K
+    itself are beyond single precision where bodies weigh milligrams.
+    """
+    basis = [n, perp(n)] if n.shape[0] == 2 else [n, *tangents(n)]
+    moved = [matvec(K, e) for e in basis]
+    mobility = dot(n, moved[0])
+    effective_mass = safe_divide(jnp.ones_like(mobility), mobility)
+    return basis, [[dot(e, m) * effective_mass for m in moved] for e in basis], effective_mass
 
 
 def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array) -> list:
-    """What friction adds to the impulse gamma n [N s], in the contact frame. It leaves the normal velocity.
+    """What friction adds to the impulse gamma n, in the contact frame. It leaves the normal velocity.
 
     Args:
-        k: K in the contact frame.
+        k, gamma: see `_in_contact_frame`; so is the result.
         slip: tangential velocity after gamma n [m/s].
     """
     stop = _stopping_impulse(k, slip)
     # sliding: P = gamma_s (n - mu along), with gamma_s such that the normal law holds
     speed = safe_sqrt(sum(s * s for s in slip))
     along = [safe_divide(s, speed) for s in slip]
-    share = 1.0 - mu * safe_divide(sum(k_nt * e for k_nt, e in zip(k[0][1:], along, strict=True)), k[0][0])
+    share = 1.0 - mu * sum(k_nt * e for k_nt, e in zip(k[0][1:], along, strict=True))
     bound = mu * (gamma + stop[0])
     sticks = (safe_sqrt(sum(P * P for P in stop[1:])) <= bound) | (share < JAMMED)
     slides = gamma / jnp.where(sticks, 1.0, share)
@@ -142,14 +149,15 @@ def _stopping_impulse(k: list, slip: list) -> list:
 
 def sticking_impulse(K: Array, n: Array, slip: Array) -> Array:
     """The impulse (D, *batch) [N s] that stops a slip (D, *batch) [m/s] and leaves the normal velocity."""
-    basis, axes = _contact_frame(n), range(n.shape[0])
-    k = [[dot(basis[i], matvec(K, basis[j])) for j in axes] for i in axes]
+    basis, k, effective_mass = _in_contact_frame(K, n)
     P = _stopping_impulse(k, [dot(e, slip) for e in basis[1:]])
-    return sum(P[i][None] * basis[i] for i in axes)
+    return sum((effective_mass * P_i)[None] * e for P_i, e in zip(P, basis, strict=True))
 
 
 def within_energy(T0: Array, b: Array, c: Array) -> Array:
     """Largest kappa <= 1 for which the kinetic energy does not rise: T0 + b kappa + c kappa^2 / 2 <= 0."""
+    scale = lax.stop_gradient(jnp.abs(T0) + jnp.abs(b) + jnp.abs(c))  # of any unit: the squares of joules may underflow
+    T0, b, c = (safe_divide(term, scale) for term in (T0, b, c))
     gains = (T0 + b + 0.5 * c > 0) & (c > 0)
     root = (safe_sqrt(b * b - 2.0 * c * jnp.minimum(T0, 0.0)) - b) / jnp.where(gains, c, 1.0)
     return jnp.where(gains, jnp.clip(root, 0.0, 1.0), 1.0)

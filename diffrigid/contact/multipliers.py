@@ -59,7 +59,7 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
         F = pushed(P, y)
         off = u - twists(F, arms, mobility)
         matrix = bodies_matrix(lambda dy: -jax.jvp(lambda y: pushed(P, y), (y,), (dy,))[1], arms, mobility)
-        du = -solve_regular(matrix, off[:, None])[:, 0]
+        du = -solve_regular(matrix, off)
         dy, weight = at_contacts(arms, du), _momenta(du, mobility, D)
 
         def ahead(share: Array) -> Array:  # slope of the convex function there

@@ -31,7 +31,7 @@ from jax.ad_checkpoint import checkpoint_name
 from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
-from diffrigid.numerics import FOUND, any_world, dot, identity, matvec, norm, safe_divide, solve_regular
+from diffrigid.numerics import FOUND, any_world, dot, norm, safe_divide, solve_regular
 from diffrigid.pytree import array, pytree, replace, static
 
 ROUNDS = 40  # at most, of Newton's method
@@ -41,9 +41,9 @@ PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not 
 SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little
 LITTLE = 0.9  # of the error before: a step that leaves more gained little
 PATIENCE = 3  # rounds that do not halve a small error: then it is rounding
-# e as a power of the spacing of numbers. A step leaves an error of relative size e / least eigenvalue of W / k, which
-# for a tower is 1e-4 and less, and one of rounding / e; with the inverse written out, of rounding / e^2.
-STEPPING, REFINING = 0.55, 0.4
+# The power of the spacing of numbers that e is. A step leaves an error of relative size e / least eigenvalue of W / k,
+# which for a tower is 1e-4 and less, and one of rounding / e.
+SMALLNESS = 0.55
 REFINEMENTS = 8  # of the linear system of the derivative
 
 
@@ -68,8 +68,8 @@ def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) 
     return P - (y - cone.target[:, None] * cone.normal) / cone.scale[:, None]
 
 
-def _slope(cone: Cone, z: Array, power: float) -> Slope:
-    """D at z, with e the spacing of numbers to a `power`."""
+def _slope(cone: Cone, z: Array) -> Slope:
+    """D at z."""
     z_n, z_t = split(cone.normal, z)
     size, bound = jax.vmap(norm)(z_t), cone.mu * jnp.maximum(z_n, 0.0)
     if cone.spin is not None:
@@ -77,7 +77,7 @@ def _slope(cone: Cone, z: Array, power: float) -> Slope:
     follows = z_n > 0 if cone.most is None else jnp.where(jnp.isinf(cone.most), z_n > 0, jnp.abs(z_n) < cone.most)
     on, slides = jnp.where(follows, cone.on, 0.0), (size >= bound).astype(z.dtype)
     bends, along = jnp.where(size < bound, 1.0, safe_divide(bound, size)), z_t / jnp.where(size > 0, size, 1.0)[:, None]
-    small = float(jnp.finfo(z.dtype).eps) ** power
+    small = float(jnp.finfo(z.dtype).eps) ** SMALLNESS
     slope = Slope(on=on, slides=slides, bends=bends, normal=cone.normal, along=along, mu=cone.mu, small=small)
     if cone.spin is None:
         return slope
@@ -141,10 +141,10 @@ def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
     return _answer(slope, cone)(at_contacts(arms, twist))
 
 
-def _newton_step(r: Array, solved: Callable, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
-    """dP of (B + D W / k) dP = r, (C, D, *batch)."""
+def _newton_step(r: Array, matrix: Array, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
+    """dP of (B + D W / k) dP = r, (C, D, *batch); the matrix is that of the twists."""
     direct = _unsloped(slope, r)[0]
-    return direct - _pushed_back(slope, cone, arms, solved(twists(direct, arms, mobility)))
+    return direct - _pushed_back(slope, cone, arms, solve_regular(matrix, twists(direct, arms, mobility)))
 
 
 class Search(NamedTuple):
@@ -188,9 +188,9 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
     """
     cone, v_rel, arms, mobility = given
-    slope = _slope(cone, now.z, STEPPING)
+    slope = _slope(cone, now.z)
     matrix = bodies_matrix(_answer(slope, cone), arms, mobility)
-    dP = _newton_step(now.r, lambda u: solve_regular(matrix, u[:, None])[:, 0], slope, cone, arms, mobility)
+    dP = _newton_step(now.r, matrix, slope, cone, arms, mobility)
     P, since = allowed(cone, now.P + dP), now.since
     z, r = _missing(P, *given)
 
@@ -251,8 +251,8 @@ def _least(cone: Cone) -> Array:
 def _lacks(cone: Cone, now: Search) -> Array:
     """Whether the best is not yet as good as rounding allows, (*batch) bool: the longer it takes, the less is asked."""
     rounding = jnp.finfo(now.P.dtype).eps
-    small = jnp.where(now.since < 5 * PATIENCE, 3.0 * rounding**0.5, jnp.inf)
-    small = jnp.where(now.since < 2 * PATIENCE, rounding**0.6, small)
+    small = jnp.where(now.since < 5 * PATIENCE, rounding**0.6, jnp.inf)
+    small = jnp.where(now.since < 2 * PATIENCE, rounding**0.75, small)
     small = jnp.where(now.since < PATIENCE, 16.0 * rounding, small)
     return now.error > small * _speed(cone, now.best) + _least(cone)
 
@@ -273,7 +273,7 @@ def _solve_together_jvp(primals, tangents):
 
     of, by = ((cone, v_rel, arms, mobility) for _, cone, v_rel, _, arms, mobility in (primals, tangents))
     change = jax.jvp(projected, of, by)[1]
-    slope = lax.stop_gradient(_slope(cone, _excess(cone, P, v_rel, arms, mobility), REFINING))
+    slope = lax.stop_gradient(_slope(cone, _excess(cone, P, v_rel, arms, mobility)))
     fixed = lax.stop_gradient((slope, cone, arms, mobility))
 
     def linear(x):
@@ -281,10 +281,9 @@ def _solve_together_jvp(primals, tangents):
 
     def refined(system, b, transposed):
         matrix = bodies_matrix(_answer(*fixed[:2]), *fixed[2:])
-        inverse = solve_regular(matrix, identity(matrix))
 
         def step(r):
-            return _newton_step(r, functools.partial(matvec, inverse), *fixed)
+            return _newton_step(r, matrix, *fixed)
 
         approximate = (lambda r: jax.linear_transpose(step, b)(r)[0]) if transposed else step
         return lax.fori_loop(0, REFINEMENTS, lambda _, x: x + approximate(b - system(x)), jnp.zeros_like(b))
