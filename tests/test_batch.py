@@ -10,6 +10,19 @@ import diffrigid as dr
 
 WORLDS = 5
 ROUNDING = 1e-11  # loops over other lengths add in another order
+# States (x, q, v, w) of two bodies
+HITS = [
+    [[0.060167493984, 0.10415523469], [0.203023812444, 0.351918470195]],
+    [[0.999843890291, -0.017669042066], [0.95562462771, -0.294587119396]],
+    [[-0.322288076727, 0.134206803629], [0.457752583558, -0.119053276436]],
+    [[0.865787501446], [-3.896623990177]],
+]
+RESTS = [
+    [[0.880800443596, 0.101898974279], [0.461256159192, 0.151880557045]],
+    [[0.999954707403, 0.009517517695], [-0.156132115974, 0.987736180547]],
+    [[0.625152393249, 0.195476755976], [-0.34752633448, 0.915854093146]],
+    [[0.982734128622], [2.316842229868]],
+]
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +56,22 @@ def test_batch_equals_loop(many, chunk):
     for i, alone in enumerate(one_by_one(world, state, v, e)):
         for name in ("x", "q", "v", "w"):
             assert_allclose(getattr(batch, name)[i], getattr(alone, name), atol=ROUNDING, err_msg=name)
+
+
+def test_other_worlds_change_nothing():
+    """A box hits a floor and a disc more often than a step has sweeps; in the world beside it, one rests."""
+    bodies = {
+        "box": dr.Body(dr.Box(half=(0.2, 0.1)), mass=1.0, x=(0.0, 0.5)),
+        "disc": dr.Body(dr.Disc(radius=0.15), mass=2.0, x=(0.1, 1.0)),
+        "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+    }
+    world, _ = dr.scene(bodies, gravity=(0.0, -9.81), restitution=0.5, friction=0.3)
+    states = [dr.State(**{n: jnp.array(v) for n, v in zip("xqvw", leaves, strict=True)}) for leaves in (HITS, RESTS)]
+    both = dr.rollout_batch(world, jax.tree.map(lambda *s: jnp.stack(s), *states), dt=1 / 60, steps=1, final_only=True)
+    for k, state in enumerate(states):
+        alone = dr.step(world, state, 1 / 60)
+        for name in "xqvw":
+            assert_allclose(getattr(both, name)[k], getattr(alone, name), atol=ROUNDING, err_msg=name)
 
 
 def test_final_state_is_the_last(many):

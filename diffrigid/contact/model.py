@@ -119,7 +119,7 @@ class Contact:
             return lax.cond(isolated & (phase == IMPACT), isolated_pass, lambda: one_pass(now, phase))
 
         def maybe(now, phase):
-            needed = jnp.where(phase == IMPACT, now.found, now.rests)
+            needed = jnp.where(phase == IMPACT, now.found, any_world(now.rests))
             if now.known is not None:
                 needed = jnp.where(phase == REVERSE, any_world(now.known.reverses()), needed)
             some_pass = isolated_or_any if tables else one_pass
@@ -130,7 +130,7 @@ class Contact:
         phases = jnp.array([IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH])
         nothing = jnp.zeros((rows, *start.state.x.shape[1:]), start.t0.dtype)
         known = with_tangents(Known(P=nothing, early=nothing), (world, dt)) if loaded else None
-        first = Progress(start, resting, known, near, jnp.asarray(any(always)))
+        first = Progress(start, resting, known, near, jnp.full(dt.shape, any(always)))
         return lax.scan(maybe, first, phases)[0].anchors
 
 
@@ -141,15 +141,17 @@ class Progress(NamedTuple):
     resting: Array  # (C, *batch) bool: contacts that rest
     known: Known | None
     found: Array  # bool: the pass before had something to do in some world
-    rests: Array  # bool: some contact of some world rests
+    rests: Array  # (*batch) bool: some contact of a world rests
 
 
 def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
-    (anchors, resting, known, *_), (impact, reverse, push) = now, (phase == kind for kind in (IMPACT, REVERSE, PUSH))
+    anchors, resting, known, _, rests = now
+    impact, reverse, push = (phase == kind for kind in (IMPACT, REVERSE, PUSH))
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting)
     opened = jnp.zeros(dt.shape, bool) if known is None else push & known.opened(strikes)
-    strikes = replace(strikes, gap=_closed(strikes, opened))
+    # Where nothing rests nothing is held at the end: a world that were alone would not pass through here.
+    strikes = replace(strikes, gap=_closed(strikes, opened), held=strikes.held & (impact | rests)[None])
     strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
     if known is not None:
         skips = reverse & ~known.reverses()
@@ -170,7 +172,7 @@ def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) 
 
     any_now = any_world(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
-    return Progress(anchors, resting, known, any_now, any_world(resting | strikes.rests))
+    return Progress(anchors, resting, known, any_now, (resting | strikes.rests).any(0))
 
 
 def _closed(strikes: Strikes, opened: Array) -> Array:
