@@ -64,7 +64,7 @@ def apply_impulses(
     if known is not None:
         P, early_P = P + known.P, early_P + known.early
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    friction = None if known is None else reversing(strikes, P, (dv, dw), law, held_for)
+    friction = None if known is None else reversing(mobility, strikes, P, (dv, dw), law, held_for)
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
     kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)

@@ -18,9 +18,11 @@ from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import same_bodies
-from diffrigid.contact.slipping import least_slip, rubbing, slips
+from diffrigid.contact.slipping import least_slip, most_resisting, rubbing, slips
 from diffrigid.numerics import any_world, dot, norm, normalise, safe_divide, sum_rows
 from diffrigid.pytree import array, pytree, replace
+
+TELLS = 0.5  # [-] share from which a trial tells how friction brakes a slip
 
 
 @pytree
@@ -50,7 +52,9 @@ def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tupl
     return strikes, Law(target, jnp.where(rubs, 0.0, mu), most)
 
 
-def reversing(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array) -> Known:
+def reversing(
+    mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array
+) -> Known:
     """Friction where a slip stops and goes back within T, from impulses P that take it to act one way.
 
     Until the stop, at a share of T, it acts one way with all of its bound, from then on the other, evenly: the sum is
@@ -60,17 +64,25 @@ def reversing(strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law
     Args:
         changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P.
     """
-    held = strikes.active & strikes.held & (T > 0)
+    held, heaviest = strikes.active & strikes.held & (T > 0), most_resisting(mobility, strikes)
 
     def found(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
         (friction, bounds), together = rubbing(strikes, P, law), same_bodies(strikes.a, strikes.b)
         at_end, slip = slips(friction, strikes, law.target, T)
         pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
-        along = slip, friction(relative_changes(strikes, *changes)), sum_rows(friction(P), together)
-        against, braked, rubs = (-jax.vmap(dot)(r, back) for r in along)
+        rubbed = friction(P)
+        against, braked, own = (
+            -jax.vmap(dot)(r, back) for r in (slip, friction(relative_changes(strikes, *changes)), rubbed)
+        )
         stops = held & (against > least_slip(T.dtype))
-        # How all of the bound brakes the slip, by what those impulses do.
-        drag = safe_divide(sum_rows(bounds, together) * braked, jnp.where(stops, rubs, 0.0))
+        # How all of the bound brakes the slip, by what those impulses do, if that tells: where friction at all contacts
+        # is about along it, and brakes as much as the heaviest mass allows.
+        rubs, strength = sum_rows(own, together), sum_rows(jax.vmap(norm)(rubbed), together)
+        per_impulse = safe_divide(braked, jnp.where(stops & (jnp.abs(rubs) > TELLS * strength), rubs, 0.0))
+        light = per_impulse * heaviest > TELLS
+        if law.most is not None:
+            light = light | jnp.isfinite(law.most)
+        drag = jnp.where(light, sum_rows(bounds, together) * per_impulse, 0.0)
         turns = stops & (drag > 0) & (pull > drag) & (against < pull + drag)
         share = safe_divide(against, jnp.where(turns, pull + drag, 0.0))[:, None]
         after = jnp.where(turns[:, None], -bounds[:, None] * back, 0.0)

@@ -46,7 +46,7 @@ def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: 
     """
     (part, bounds), most = rubbing(strikes, P, law), law.most
     at_end, slip = slips(part, strikes, law.target, T)
-    most_to_stop = _heaviest(mobility, strikes) * jax.vmap(norm)(at_end)
+    most_to_stop = most_resisting(mobility, strikes) * jax.vmap(norm)(at_end)
     if most is not None:
         most_to_stop = jnp.where(jnp.isfinite(most), bounds, most_to_stop)
     return lost_to_stops(strikes, T, slip, at_end, part(P), bounds, most_to_stop)
@@ -75,7 +75,7 @@ def slips(part: Callable, strikes: Strikes, target: Array, T: Array) -> tuple[Ar
     return at_end, at_end - T[:, None] * part(strikes.pull)
 
 
-def _heaviest(mobility: Mobility, strikes: Strikes) -> Array:
+def most_resisting(mobility: Mobility, strikes: Strikes) -> Array:
     """What most resists a slip of each contact, (C, *batch) [kg]: the reduced mass, with joints the mass of all."""
     if mobility.matrix is not None:
         return jnp.broadcast_to((1.0 / mobility.inverse_mass).sum(0)[None], strikes.s.shape)
@@ -107,7 +107,7 @@ def lost_to_stops(
     # Against the slip: what contacts of the same two bodies do against each other stops nothing.
     own = -jax.vmap(dot)(friction, at_end / jnp.where(at_end_speed > 0, at_end_speed, 1.0)[:, None])
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
-    size, bound = jax.vmap(norm)(in_all(friction)), in_all(bounds)
+    size, bound = jnp.abs(in_all(own)), in_all(bounds)
     most = jnp.minimum(size, most_to_stop)
     own, size = own * safe_divide(most, size), most
     whole = at_end_speed * bound + size * (speed - along)
