@@ -126,6 +126,25 @@ def test_on_vertices_in_line_in_a_valley_and_on_a_peak(shape):
     assert_allclose(x, expected, atol=EXACT)
 
 
+@pytest.mark.parametrize("shape", [dr.Disc(radius=0.2), dr.Box(half=(0.3, 0.2))])
+def test_what_slips_over_vertices_in_line_slips_as_on_a_plane(shape):
+    """With friction and restitution; also its slopes."""
+    grounds = dr.Profile(points=IN_LINE), dr.HalfSpace(normal=(0.0, 1.0))
+
+    def path(ground, v, mu):
+        bodies = {"body": dr.Body(shape, mass=1.3, x=(0.0, 0.2), v=vector(v, 0.0)), "ground": dr.Static(ground)}
+        world, state = dr.scene(bodies, gravity=(0.0, -G), restitution=0.5, friction=mu)
+        path = dr.rollout(world, state, dt=1 / 60, steps=30).state
+        return jnp.concatenate([path.x[:, 0], path.q[:, 0], path.w[:, 0]], axis=1)
+
+    p = jnp.asarray(1.9), jnp.asarray(0.15)
+    (got, slopes), (expected, true_slopes) = (
+        jax.jit(with_slopes(lambda *p, ground=ground: path(ground, *p)))(*p) for ground in grounds
+    )
+    assert_allclose(got, expected, atol=EXACT)
+    assert_allclose(slopes, true_slopes, atol=EXACT)
+
+
 VEE, ROOF = np.array([(-3.0, 2.1), (0.1, 0.0), (3.0, 1.2)]), np.array([(-3.0, -2.1), (0.1, 0.0), (3.0, -1.2)])
 
 

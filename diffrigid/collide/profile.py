@@ -24,6 +24,7 @@ from diffrigid.state import rotations
 
 FAR = 1e6  # [m] gap of what cannot meet
 ALERT = 4e-3  # [-] of the size: least gap of what may meet within the step; above `NEAR` of the impact time
+STRAIGHT = 1e-4  # one less the cosine between two segments along which a body goes on as along one
 TURN = 1e-9  # [rad] by which a convex vertex turns at least
 
 
@@ -45,6 +46,19 @@ def convex_profile(a, x_a: Array, q_a: Array, b: Profile, x_b: Array, q_b: Array
     c = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
     normal, point = (jax.vmap(lambda r: so.rotate(q_b, r))(r) for r in (c.normal, c.point))
     return Contacts(gap=c.gap, normal=normal, point=point + x_b[None])
+
+
+def on_next_segments(a, b: Profile, rests: Array) -> Array:
+    """Which contacts of `convex_profile` rest (K, *batch), with those of a corner that rests, on segments straight on.
+
+    So a body that slides or rolls from one segment to the next is held there as before, and does not strike it.
+    """
+    up = lax.stop_gradient(_up(_segments(b)[1]))
+    count = len(vertices(a, 2)) * len(up)
+    on = rests[:count].reshape(-1, len(up), *rests.shape[1:])
+    mean = jax.vmap(normalise)(jnp.where(on[:, :, None], up[None], 0.0).sum(1))
+    straight = (up[None] * mean[:, None]).sum(2) > 1.0 - STRAIGHT
+    return jnp.concatenate([(on | straight).reshape(count, *rests.shape[1:]), rests[count:]])
 
 
 def clearance(b: Profile, p: Array) -> Array:

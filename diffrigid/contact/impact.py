@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.collide.profile import on_next_segments
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.search import NEAR, approach_search, at_corners, if_smooth, touches
 from diffrigid.contact.sides import (
@@ -39,7 +40,7 @@ from diffrigid.numerics import (
     softplus,
     unfused,
 )
-from diffrigid.shapes import Disc, HalfSpace, Shape, Sphere
+from diffrigid.shapes import Disc, HalfSpace, Profile, Shape, Sphere
 from diffrigid.state import rotations
 
 
@@ -62,6 +63,7 @@ def find_impact(
     if closed_form(a.shape, b.shape, straight) and not varying:
         s0, level, found, _ = unfused(live, approach, a, b, width)
         rests = _round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
+        found = found & ~rests[0]  # it would always meet next, and hide what else the bodies meet
     else:
         s0, level, found, rests = approach_search(a, b, t1, width, rest_speed, at_end)
     hit = found & (s0 <= t1) & ~at_end
@@ -81,6 +83,8 @@ def find_impact(
     if len(rests) != len(gap):  # contacts are some of many places: of the corners of a box, or of those of a grid
         few = isinstance(b.shape, HalfSpace)
         rests = at_corners(a, at_a, moved, rests) if few else jnp.broadcast_to(rests.any(0), gap.shape)
+    elif isinstance(b.shape, Profile):
+        rests = on_next_segments(a.shape, b.shape, rests)
     return Meeting(s=s, hit=hit | at_end, fast=closing.any(0), rests=rests & ~at_end, level=level, slack=slack)
 
 

@@ -15,7 +15,7 @@ from diffrigid.contact.sides import at_colliders, body_sides
 from diffrigid.numerics import any_world, rows
 from diffrigid.pytree import array, pytree, replace
 
-SOON = 1e-4  # [-] of a step: what is held no longer than this need not be
+SOON = 0.25  # power of the spacing of numbers, of a step: what is held no longer than this need not be
 
 
 @pytree
@@ -133,7 +133,7 @@ def _of_clusters(
     member = label[None] == label[:, None]
     until, bounce, begins = (jnp.where(member, t[None], jnp.inf).min(1) for t in (first, first_bounce, t0))
     supported = (member & links.of_bodies(jnp.max, rests, False)[None]).any(1) & (until < jnp.inf)
-    waits = until - begins > SOON * dt[None]
+    waits = until - begins > jnp.finfo(dt.dtype).eps ** SOON * dt[None]
     held, along = supported & waits, supported & ~waits & (until < bounce)
     return jnp.where(held, until, jnp.inf), jnp.where(along, until, jnp.inf)
 
