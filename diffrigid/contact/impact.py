@@ -63,7 +63,6 @@ def find_impact(
     if closed_form(a.shape, b.shape, straight) and not varying:
         s0, level, found, _ = unfused(live, approach, a, b, width)
         rests = _round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
-        found = found & ~rests[0]  # it would always meet next, and hide what else the bodies meet
     else:
         s0, level, found, rests = approach_search(a, b, t1, width, rest_speed, at_end)
     hit = found & (s0 <= t1) & ~at_end
@@ -74,6 +73,8 @@ def find_impact(
     moved = contacts_of(a, at_a, b, at_b)
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
     closing = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
+    if len(rests) == len(gap) == 1:  # what rests would always meet next when it falls, and hide what else is met
+        closing = closing & ~rests
     share = closing.astype(s0.dtype) / jnp.maximum(closing.sum(0), 1)[None].astype(s0.dtype)
     s = implicit_root(s0, (share * moved.gap).sum(0) - level, (share * speed).sum(0))
     # What is already inside where the paths begin is struck there, whatever its gap.
