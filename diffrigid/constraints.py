@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from diffrigid.gathers import rows
 from diffrigid.joints import Pose
-from diffrigid.numerics import rows
 from diffrigid.pytree import replace
 
 

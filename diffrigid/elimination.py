@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.numerics import opaque_true, rows_or_zeros, unfused
+from diffrigid.branches import opaque_true, unfused
+from diffrigid.gathers import rows_or_zeros
 
 ROUNDING = 1e2  # times the spacing of numbers at the diagonal: a pivot of a loop that is no larger is zero
 

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import opaque_true, unfused
 from diffrigid.constraints import (
     Placed,
     by_twists,
@@ -30,8 +31,9 @@ from diffrigid.constraints import (
     placed,
 )
 from diffrigid.elimination import Factor, factorise, plan, substitute
+from diffrigid.gathers import rows_or_zeros
 from diffrigid.joints import Pose
-from diffrigid.numerics import dot, opaque_true, rows_or_zeros, unfused
+from diffrigid.numerics import dot
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, rotations
 

@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import any_world, components, cos_sin, dot, fold, safe_sqrt
+from diffrigid.branches import any_world
+from diffrigid.gathers import fold
+from diffrigid.numerics import components, cos_sin, dot, safe_sqrt
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.branches import opaque_true
 from diffrigid.compiling import uncollected
 from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
-from diffrigid.numerics import opaque_true, with_tangents
+from diffrigid.numerics import with_tangents
 from diffrigid.paths import read
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.shapes import traced

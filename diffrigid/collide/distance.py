@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.numerics import dot, norm, normalise, rows, unit_vector
+from diffrigid.gathers import rows
+from diffrigid.numerics import dot, norm, normalise, unit_vector
 from diffrigid.shapes import Box, Capsule, Disc, Hull, Polygon, Sphere, radius, vertices
 from diffrigid.so3 import cross
 

@@ -11,7 +11,8 @@ from jax import Array, lax
 
 from diffrigid import so3
 from diffrigid.collide.contacts import Contacts
-from diffrigid.numerics import dot, norm, normalise, rows, unit_vector
+from diffrigid.gathers import rows
+from diffrigid.numerics import dot, norm, normalise, unit_vector
 from diffrigid.shapes import Capsule, edge_apexes, edges, radius
 
 FAR = 1e6  # [m] gap of a crossing that does not exist

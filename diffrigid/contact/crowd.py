@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.branches import any_world
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.grid import Near, neighbours, pick
 from diffrigid.contact.impact import approach
@@ -25,7 +26,8 @@ from diffrigid.contact.impulse import impulses
 from diffrigid.contact.sides import Side
 from diffrigid.contact.strikes import Material, law, materials, next_strikes
 from diffrigid.flight import launch, orientation, state_at
-from diffrigid.numerics import FOUND, any_world, dot, norm, rows
+from diffrigid.gathers import rows
+from diffrigid.numerics import FOUND, dot, norm
 from diffrigid.pytree import map_arrays, pytree, replace
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State, rotations

@@ -14,13 +14,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import any_world
 from diffrigid.contact.cone import Cone
 from diffrigid.contact.impulse import within_energy
 from diffrigid.contact.mobility import Arms, Mobility, moved
 from diffrigid.contact.order import Links, hanging_together
 from diffrigid.contact.sides import at_pairs, pair_sum, pairs_of
 from diffrigid.contact.together import solve_together
-from diffrigid.numerics import any_world, dot
+from diffrigid.numerics import dot
 from diffrigid.pytree import replace
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import any_world
+from diffrigid.branches import any_world
 
 CELLS = 4  # for each body
 SPREAD = 2.5  # [-] standard deviations that the grid reaches to both sides; who is farther counts as on its edge

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide.profile import on_next_segments
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.search import NEAR, approach_search, at_corners, if_smooth, touches
@@ -28,18 +29,7 @@ from diffrigid.contact.sides import (
     place,
     reach_of,
 )
-from diffrigid.numerics import (
-    FOUND,
-    dot,
-    implicit_root,
-    norm,
-    normalise,
-    opaque_true,
-    safe_divide,
-    safe_sqrt,
-    softplus,
-    unfused,
-)
+from diffrigid.numerics import FOUND, dot, implicit_root, norm, normalise, safe_divide, safe_sqrt, softplus
 from diffrigid.shapes import Disc, HalfSpace, Profile, Shape, Sphere
 from diffrigid.state import rotations
 

@@ -22,7 +22,8 @@ from jax import Array, lax
 
 from diffrigid.contact.levers import Levers
 from diffrigid.contact.sides import Placed
-from diffrigid.numerics import dot, matvec, safe_divide, safe_sqrt
+from diffrigid.linear import matvec
+from diffrigid.numerics import dot, safe_divide, safe_sqrt
 from diffrigid.so2 import perp
 from diffrigid.so3 import tangents
 from diffrigid.state import rotations

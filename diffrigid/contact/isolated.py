@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import any_world, opaque_true, unfused
 from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
@@ -24,7 +25,8 @@ from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, sum_of_t
 from diffrigid.contact.strikes import is_rolling, materials, mixed, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
-from diffrigid.numerics import any_world, constant, dot, fold, opaque_true, unfused
+from diffrigid.gathers import constant, fold
+from diffrigid.numerics import dot
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 

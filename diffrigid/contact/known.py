@@ -14,12 +14,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import any_world
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import same_bodies
 from diffrigid.contact.slipping import least_slip, most_resisting, rubbing, slips
-from diffrigid.numerics import any_world, dot, norm, normalise, safe_divide, sum_rows
+from diffrigid.gathers import sum_rows
+from diffrigid.numerics import dot, norm, normalise, safe_divide
 from diffrigid.pytree import array, pytree, replace
 
 TELLS = 0.5  # [-] share from which a trial tells how friction brakes a slip

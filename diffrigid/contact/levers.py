@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from diffrigid.branches import unfused
 from diffrigid.collide import Contacts
 from diffrigid.contact.sides import Placed, Side, contacts_of
-from diffrigid.numerics import dot, safe_divide, unfused
+from diffrigid.numerics import dot, safe_divide
 from diffrigid.pytree import array, pytree
 from diffrigid.state import rotations
 

@@ -9,8 +9,10 @@ from jax import Array
 
 from diffrigid.contact.cone import put
 from diffrigid.contact.sides import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
+from diffrigid.gathers import sum_rows
+from diffrigid.linear import identity, matvec
 from diffrigid.linkage import Linkage, spread
-from diffrigid.numerics import dot, identity, matvec, sum_rows, unit_vector
+from diffrigid.numerics import dot, unit_vector
 from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import rotations
 

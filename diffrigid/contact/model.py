@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import any_world
 from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.apply import apply_impulses
 from diffrigid.contact.crowd import step_crowd
@@ -42,7 +43,8 @@ from diffrigid.contact.strikes import (
     waits,
 )
 from diffrigid.flight import Flight, state_at
-from diffrigid.numerics import FOUND, any_world, constant, dot, safe_divide, with_tangents
+from diffrigid.gathers import constant
+from diffrigid.numerics import FOUND, dot, safe_divide, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
 

@@ -20,9 +20,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import any_world
 from diffrigid.contact.cone import Cone, nearest, put, split
 from diffrigid.contact.mobility import Mobility, at_contacts, bodies_matrix, twists
-from diffrigid.numerics import any_world, norm, solve_regular
+from diffrigid.linear import solve_regular
+from diffrigid.numerics import norm
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most

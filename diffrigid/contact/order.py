@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import any_world
 from diffrigid.contact.sides import at_colliders, body_sides
-from diffrigid.numerics import any_world, rows
+from diffrigid.gathers import rows
 from diffrigid.pytree import array, pytree, replace
 
 SOON = 0.25  # power of the spacing of numbers, of a step: what is held no longer than this need not be

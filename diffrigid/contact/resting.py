@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import any_world
 from diffrigid.contact.cone import Cone
 from diffrigid.contact.gain import solve_without_gain
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sides import at_colliders
-from diffrigid.numerics import any_world, safe_divide, safe_sqrt
+from diffrigid.numerics import safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.branches import any_world, opaque_true
 from diffrigid.collide import Contacts
 from diffrigid.collide.heights import height_over, unseen_for
 from diffrigid.contact.sides import (
@@ -22,18 +23,8 @@ from diffrigid.contact.sides import (
     reach_of,
     relative_acceleration,
 )
-from diffrigid.numerics import (
-    FOUND,
-    MANY,
-    any_world,
-    dot,
-    fold,
-    norm,
-    opaque_true,
-    safe_divide,
-    safe_sqrt,
-    softplus,
-)
+from diffrigid.gathers import MANY, fold
+from diffrigid.numerics import FOUND, dot, norm, safe_divide, safe_sqrt, softplus
 from diffrigid.shapes import HalfSpace, HeightField, radius, vertices
 from diffrigid.state import rotations
 

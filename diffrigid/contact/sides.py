@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.branches import unfused
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.distance import reach
 from diffrigid.collide.heights import candidates
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
-from diffrigid.numerics import dot, fold, norm, rows, sum_rows, unfused
+from diffrigid.gathers import fold, rows, sum_rows
+from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations

@@ -11,7 +11,8 @@ from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, momentum_changes
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders, same_bodies
-from diffrigid.numerics import constant, dot, norm, safe_divide, sum_rows
+from diffrigid.gathers import constant, sum_rows
+from diffrigid.numerics import dot, norm, safe_divide
 from diffrigid.pytree import replace
 
 STICKS = 1.0 - 1e-6  # of the bound of friction

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.impulse import impulses
@@ -19,7 +20,8 @@ from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
 from diffrigid.contact.strikes import law, materials, next_strikes
 from diffrigid.flight import Flight, orientation
-from diffrigid.numerics import dot, fold, opaque_true, pack, unfused
+from diffrigid.gathers import fold, pack
+from diffrigid.numerics import dot
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 

@@ -18,8 +18,9 @@ from diffrigid.constraints import by_twists
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.resting import Strikes
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
+from diffrigid.gathers import rows
 from diffrigid.joints import Pose
-from diffrigid.numerics import FOUND, implicit_root, rows, safe_divide, unit_vector
+from diffrigid.numerics import FOUND, implicit_root, safe_divide, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.branches import any_world, opaque_true, unfused
 from diffrigid.collide import Contacts
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
@@ -20,8 +21,9 @@ from diffrigid.contact.sides import Side, began, centre, contacts_of, place, rea
 from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
+from diffrigid.gathers import constant, rows
 from diffrigid.linkage import islands
-from diffrigid.numerics import any_world, constant, dot, norm, opaque_true, rows, unfused
+from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations

@@ -28,10 +28,12 @@ import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.branches import any_world
 from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
-from diffrigid.numerics import FOUND, any_world, dot, norm, safe_divide, solve_regular
+from diffrigid.linear import solve_regular
+from diffrigid.numerics import FOUND, dot, norm, safe_divide
 from diffrigid.pytree import array, pytree, replace, static
 
 ROUNDS = 40  # at most, of Newton's method

@@ -1,0 +1,103 @@
+"""Rows of arrays that are picked, summed and packed by indices that are known when tracing.
+
+XLA does not vectorise a gather on a CPU, and runs a scatter, its transpose, row by row: each function here gathers only
+where slices and reshapes do not do.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+FEW, MANY = 12, 40  # terms of a sum that is written out: where there are many such sums, where there are few
+
+
+def rows(values: Array, index: tuple) -> Array:
+    """values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples.
+
+    A NumPy array made on the spot would be an argument of every loop and branch around it, and one of what
+    reverse mode saves: a program of some hundred contacts took three times as long to compile. This one is
+    made once.
+    """
+    first, flat = index[0], not isinstance(index[0], tuple)
+    if flat and index == (first,) * len(index):
+        return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))
+    if flat and index == tuple(range(first, first + len(index))):
+        return values[first : first + len(index)]
+    return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def sum_rows(values: Array, index: tuple) -> Array:
+    """Sums of rows of values (M, ...), for an index known when tracing, (len(index), ...); M stands for nothing.
+
+    Where each sum is over a run of rows and one run follows the other, it is written out. Else rows are gathered,
+    padded to the most that any sum has: forward that is one fused loop, where a scatter is a serial one.
+    """
+    distinct = tuple(dict.fromkeys(index))
+    runs = [tuple(i for i in row if i < len(values)) for row in distinct]
+    start, length = min(runs[0], default=0), len(runs[0])
+    regular = all(len(run) == length for run in runs)
+    if length and regular and sum(runs, ()) == tuple(range(start, start + length * len(runs))):
+        part = values[start : start + length * len(runs)]
+        sums = fold(jnp.add, part.reshape(len(runs), length, *part.shape[1:]), 1)
+    else:
+        table = rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), distinct)
+        sums = fold(jnp.add, table, 1) if len(distinct[0]) <= FEW else table.sum(1)
+    if distinct == index:
+        return sums
+    if index == tuple(row for row in distinct for _ in range(len(index) // len(distinct))):
+        return jnp.repeat(sums, len(index) // len(distinct), axis=0)
+    return rows(sums, tuple(distinct.index(row) for row in index))
+
+
+def fold(op: Any, table: Array, axis: int) -> Array:
+    """Reduction over one axis in front of the batch. Written out: XLA's own is slow."""
+    return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
+
+
+def rows_or_zeros(values: Array, index: tuple) -> Array:
+    """`rows`, where the index -1 stands for zeros."""
+    table = np.array(index)
+    if (table >= 0).all():
+        return rows(values, index)
+    some = np.maximum(table, 0).tolist()
+    chosen = rows(values, tuple(some if table.ndim == 1 else map(tuple, some)))
+    there = (constant(index, "int32") >= 0).reshape(*table.shape, *[1] * (chosen.ndim - table.ndim))
+    return jnp.where(there, chosen, 0.0)
+
+
+def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]], Any]]:
+    """The leaves (M, ..., *batch) of a tree side by side, as one array (M, F, *batch) for each shape of the batch.
+
+    Returns:
+        the arrays, and the function that makes the tree from such arrays again, whatever their leading length.
+    """
+    leaves, treedef = jax.tree.flatten(tree)
+    batches = [leaf.shape[leaf.ndim - batch_rank :] for leaf in leaves]
+    insides = [leaf.shape[1 : leaf.ndim - batch_rank] for leaf in leaves]
+    members = [[k for k in range(len(leaves)) if batches[k] == batch] for batch in dict.fromkeys(batches)]
+
+    def column(k: int) -> Array:
+        return leaves[k].reshape(leaves[k].shape[0], -1, *batches[k])
+
+    def unpack(columns: list[Array]) -> Any:
+        parts: dict[int, Array] = {}
+        for whole, group in zip(columns, members, strict=True):
+            start = 0
+            for k in group:
+                stop = start + int(np.prod(insides[k], dtype=int))
+                part, start = whole[:, start:stop], stop
+                parts[k] = part.reshape(part.shape[0], *insides[k], *part.shape[2:])
+        return jax.tree.unflatten(treedef, [parts[k] for k in range(len(leaves))])
+
+    return [jnp.concatenate([column(k) for k in group], axis=1) for group in members], unpack
+
+
+@functools.cache
+def constant(table: tuple, dtype: str) -> np.ndarray:
+    """A tuple, or a tuple of tuples, as an array that is made once; see `rows`."""
+    return np.array(table, dtype)

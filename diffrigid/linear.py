@@ -1,0 +1,95 @@
+"""Matrices of the batch: products, and the solution of systems that are regular."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from diffrigid.gathers import MANY, fold
+from diffrigid.numerics import safe_divide
+
+TINY = 6  # rows of a matrix, up to which its elimination is written out
+SMALL = 9  # rows of a matrix, up to which all of a batch at once are faster than a library that takes one by one
+
+
+def solve_regular(matrix: Array, right: Array) -> Array:
+    """x of matrix x = right, for regular matrices, (R, R, *batch), (R, *batch) -> (R, *batch).
+
+    Linear in `right`, also for transposition; without derivative by the matrix. Finite where a matrix is singular,
+    but no solution.
+    """
+    matrix = lax.stop_gradient(matrix)
+
+    def by(matrix: Array) -> Callable[[Any, Array], Array]:
+        return lambda _, u: _eliminated(matrix, u)
+
+    back = by(jnp.swapaxes(matrix, 0, 1))
+    return lax.custom_linear_solve(functools.partial(matvec, matrix), right, by(matrix), transpose_solve=back)
+
+
+def _eliminated(matrix: Array, right: Array) -> Array:
+    system = jnp.concatenate([matrix, right[:, None]], axis=1)
+    if len(matrix) <= TINY:
+        return _written_out(system)
+    if len(matrix) <= SMALL:
+        return _gauss_jordan(system)
+    # What elimination makes of the right side beside the matrix needs no permutation.
+    upper, reduced = jnp.split(lax.linalg.lu(jnp.moveaxis(system, (0, 1), (-2, -1)))[0], [len(matrix)], axis=-1)
+    x = lax.linalg.triangular_solve(upper, reduced, left_side=True)[..., 0]
+    return jnp.moveaxis(jnp.where(jnp.isfinite(x), x, 0.0), -1, 0)
+
+
+def matvec(matrix: Array, u: Array) -> Array:
+    """(R, R, *batch) times (R, *batch)."""
+    parts = matrix * u[None]
+    return fold(jnp.add, parts, 1) if len(u) <= MANY else parts.sum(1)
+
+
+def identity(like: Array) -> Array:
+    """Unit matrices, (R, R, *batch)."""
+    size, batch = like.shape[0], like.shape[2:]
+    return jnp.eye(size, dtype=like.dtype).reshape(size, size, *[1] * len(batch)) + jnp.zeros_like(like)
+
+
+def _written_out(system: Array) -> Array:
+    """x of a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch), without a choice of pivots.
+
+    No choice is needed where the matrix is the product of a block-diagonal one and one with a positive definite
+    symmetric part, as that of a body is but for strong friction. A direction whose pivot is 0 is left out.
+    """
+    eliminated = []
+    while len(system):
+        pivot = system[0, 0]
+        eliminated.append(system[0, 1:] * safe_divide(jnp.ones_like(pivot), pivot)[None])
+        system = system[1:, 1:] - system[1:, :1] * eliminated[-1][None]
+    x: list[Array] = []
+    for row in reversed(eliminated):
+        x.insert(0, functools.reduce(jnp.subtract, [a * b for a, b in zip(row[:-1], x, strict=True)], row[-1]))
+    return jnp.stack(x)
+
+
+def _gauss_jordan(system: Array) -> Array:
+    """x of a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch).
+
+    Pivots are chosen by column in each matrix of the batch; rows stay where they are. A direction whose pivot is 0 is
+    left out.
+    """
+    count = system.shape[0]
+    index = lax.broadcasted_iota(np.int32, (count, *system.shape[2:]), 0)
+
+    def eliminate(k, carry):
+        system, order = carry
+        column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
+        best = jnp.argmax(jnp.where(order < count, -1.0, jnp.abs(column)), 0)
+        chosen = index == best.astype(np.int32)[None]
+        row = jnp.where(chosen[:, None], system, 0.0).sum(0)
+        pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
+        row = row * safe_divide(jnp.ones_like(pivot), pivot)[None]
+        system = jnp.where(chosen[:, None], row[None], system - column[:, None] * row[None])
+        return system, jnp.where(chosen, k, order)
+
+    system, order = lax.fori_loop(0, count, eliminate, (system, jnp.full_like(index, count)))
+    return jnp.where(order[None] == index[:, None], system[None, :, count], 0.0).sum(1)
