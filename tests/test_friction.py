@@ -63,6 +63,40 @@ def test_block_on_a_slope(case):
     assert_allclose(slopes, true_slopes, atol=1e-9)
 
 
+def welded(up, normal, slope, v):
+    first, second = (
+        dr.Body(dr.Box(half=(0.2, 0.5)), mass=mass, x=0.5 * normal + s * up, angle=slope, v=v * up)
+        for mass, s in ((1.0, 0.0), (3.0, 0.7))
+    )
+    return {"block": first, "other": second, "floor": floor(slope)}, [dr.Weld("other", "block")]
+
+
+def on_tiles(up, normal, slope, v):
+    tiles = (dr.Static(dr.Box(half=(1.0, 0.2)), x=s * up - 0.2 * normal, angle=slope) for s in (-0.95, 1.05))
+    body = dr.Body(dr.Box(half=(0.2, 0.1)), mass=1.0, x=0.1 * normal, angle=slope, v=v * up)
+    return {"block": body, "left": next(tiles), "right": next(tiles)}, []
+
+
+@pytest.mark.parametrize("made", [welded, on_tiles])
+def test_what_slides_as_one(made):
+    """Two boxes that are welded, or one on two floors: up a slope, over the gap, to a stop within a step, and back."""
+
+    def end(mu, v, slope):
+        up, normal = vector(jnp.cos(slope), jnp.sin(slope)), vector(-jnp.sin(slope), jnp.cos(slope))
+        bodies, joints = made(up, normal, slope, v)
+        world, state = dr.scene(bodies, gravity=(0.0, -G), friction=mu, joints=joints)
+        x = dr.rollout(world, state, dt=1 / 60, steps=30).state.x
+        return (x[-1, 0] - x[0, 0]) @ up
+
+    value_and_slopes = jax.jit(with_slopes(end))
+    for case in ((0.3, 1.0, 0.0), (0.1, 1.0, 0.2)):
+        p, t = tuple(map(jnp.asarray, case)), jnp.asarray(0.5)
+        x, slopes = value_and_slopes(*p)
+        expected, true_slopes = jax.value_and_grad(block_in_closed_form, (0, 1, 2))(*p, t)
+        assert_allclose(x, expected, atol=1e-12)
+        assert_allclose(slopes, true_slopes, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_block_on_a_slope_in_space():
     """Thrown up a slope that rises in no plane of the world, it stops within a step and slides back."""

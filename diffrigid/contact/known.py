@@ -18,7 +18,7 @@ from diffrigid.branches import any_world
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.sides import same_bodies
+from diffrigid.contact.sides import alike
 from diffrigid.contact.slipping import least_slip, most_resisting, rubbing, slips
 from diffrigid.gathers import sum_rows
 from diffrigid.numerics import dot, norm, normalise, safe_divide
@@ -33,10 +33,11 @@ class Known:
 
     P: Array = array("C", "D")  # [N s]; where gaps are closed [kg m]
     early: Array = array("C", "D")  # [N s^2] what they move bodies by beside an even force: where friction reverses
+    rubs: Array = array("C")  # 1 where friction reverses, so that all of it is known, else 0
 
     def reverses(self) -> Array:
         """Whether some friction reverses in a world, (*batch) bool."""
-        return (self.early != 0).any((0, 1))
+        return (self.rubs > 0).any(0)
 
     def opened(self, strikes: Strikes) -> Array:
         """Whether a gap of a world is open, by more than rounding, where a contact carries a load, (*batch) bool."""
@@ -48,7 +49,7 @@ class Known:
 
 def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tuple[Strikes, Law]:
     """Strikes and law of the impulses that are not known. Friction that is known acts no more."""
-    (target, mu, most), rubs = law, (known.early != 0).any(1)
+    (target, mu, most), rubs = law, known.rubs > 0
     most = None if most is None else jnp.where(rubs & jnp.isfinite(most), 0.0, most)
     strikes = replace(strikes, v_rel=strikes.v_rel + moved(known.P, strikes, mobility))
     return strikes, Law(target, jnp.where(rubs, 0.0, mu), most)
@@ -69,7 +70,11 @@ def reversing(
     held, heaviest = strikes.active & strikes.held & (T > 0), most_resisting(mobility, strikes)
 
     def found(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
-        (friction, bounds), together = rubbing(strikes, P, law), same_bodies(strikes.a, strikes.b)
+        (friction, bounds), together = rubbing(strikes, P, law), alike(strikes.wholes)
+
+        def in_all(values: Array) -> Array:  # over the contacts of two rigid wholes that slip, which they do as one
+            return sum_rows(jnp.where(stops, values, 0.0), together)
+
         at_end, slip = slips(friction, strikes, law.target, T)
         pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
         rubbed = friction(P)
@@ -79,20 +84,23 @@ def reversing(
         stops = held & (against > least_slip(T.dtype))
         # How all of the bound brakes the slip, by what those impulses do, if that tells: where friction at all contacts
         # is about along it, and brakes as much as the heaviest mass allows.
-        rubs, strength = sum_rows(own, together), sum_rows(jax.vmap(norm)(rubbed), together)
-        per_impulse = safe_divide(braked, jnp.where(stops & (jnp.abs(rubs) > TELLS * strength), rubs, 0.0))
+        aside, strength = (in_all(jax.vmap(norm)(r)) for r in (rubbed + own[:, None] * back, rubbed))
+        rubs, rounding = in_all(own), jnp.finfo(T.dtype).eps ** 0.5
+        tells = stops & (jnp.abs(rubs) > TELLS * aside) & (jnp.abs(rubs) > rounding * strength)
+        per_impulse = safe_divide(braked, jnp.where(tells, rubs, 0.0))
         light = per_impulse * heaviest > TELLS
         if law.most is not None:
             light = light | jnp.isfinite(law.most)
-        drag = jnp.where(light, sum_rows(bounds, together) * per_impulse, 0.0)
+        drag = jnp.where(light, in_all(bounds) * per_impulse, 0.0)
         turns = stops & (drag > 0) & (pull > drag) & (against < pull + drag)
         share = safe_divide(against, jnp.where(turns, pull + drag, 0.0))[:, None]
         after = jnp.where(turns[:, None], -bounds[:, None] * back, 0.0)
-        return Known(P=(1.0 - 2.0 * share) * after, early=-share * (1.0 - share) * T[:, None] * after)
+        early = -share * (1.0 - share) * T[:, None] * after
+        return Known(P=(1.0 - 2.0 * share) * after, early=early, rubs=turns.astype(T.dtype))
 
     def nothing(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
         del changes, law
-        return Known(P=jnp.zeros_like(P), early=jnp.zeros_like(P))
+        return Known(P=jnp.zeros_like(P), early=jnp.zeros_like(P), rubs=jnp.zeros_like(T))
 
     return lax.cond(any_world(held), found, nothing, P, changes, law)
 

@@ -131,7 +131,7 @@ class Contact:
         loaded, rows = is_loaded(world), len(always) + is_rolling(world) * contact_count(world)
         phases = jnp.array([IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH])
         nothing = jnp.zeros((rows, *start.state.x.shape[1:]), start.t0.dtype)
-        known = with_tangents(Known(P=nothing, early=nothing), (world, dt)) if loaded else None
+        known = with_tangents(Known(P=nothing, early=nothing, rubs=nothing[:, 0]), (world, dt)) if loaded else None
         first = Progress(start, resting, known, near, jnp.full(dt.shape, any(always)))
         return lax.scan(maybe, first, phases)[0].anchors
 

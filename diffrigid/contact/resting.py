@@ -40,6 +40,7 @@ class Strikes:
     drift: Array = array("C", "D")  # [m/s] half the velocity of a against b, of the centres; 0 at a static
     a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
     b: tuple[int, ...] = static(default=())
+    wholes: tuple = static(default=())  # a label of each contact and row: those with the same slip as one
     jac: Any = array("R", "2", "D + A", default=None)  # of the last R, which are rows of joints; see `Arms`
     mid_jac: Any = array("R", "2", "D + A", default=None)
     spin: Any = array("K", default=None)  # [m] of K rows behind the first K contacts, against turning; see `Cone`

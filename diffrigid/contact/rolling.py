@@ -40,7 +40,7 @@ def with_rows(
     zero = jnp.zeros((count, *batch), t.dtype)
     roll, spin = (kick * _of_contacts(world, f"{name}_friction", zero)[:count] for name in ("rolling", "spinning"))
     roll, spin = (zero, roll) if flat else (roll, spin)
-    a, b = strikes.a[:count], strikes.b[:count]
+    a, b, own = strikes.a[:count], strikes.b[:count], strikes.wholes[:count]
 
     def turns(values: Array) -> Array:  # of the bodies, (N, A, *batch), to a against b as vectors
         change = at_colliders(values, a, 0.0) - at_colliders(values, b, 0.0)
@@ -57,8 +57,9 @@ def with_rows(
         pull=turns(pull), drift=none, rests=strikes.rests[:count], now=strikes.now[:count], held=strikes.held[:count],
     )  # fmt: skip
     strikes = replace(
-        jax.tree.map(partial(_behind, count), replace(strikes, a=(), b=(), jac=None, mid_jac=None), rows),
+        jax.tree.map(partial(_behind, count), replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None), rows),
         a=a + a + strikes.a[count:], b=b + b + strikes.b[count:], jac=strikes.jac, mid_jac=strikes.mid_jac, spin=spin,
+        wholes=own + tuple(("turn", *label) for label in own) + strikes.wholes[count:],
     )  # fmt: skip
     target, mu, most = law
     mu = jnp.broadcast_to(mu, target.shape)
@@ -110,8 +111,9 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: A
 def rows_of(strikes: Strikes) -> Strikes:
     """The rows that turn."""
     spin, count = strikes.spin, len(strikes.spin)
-    rows = jax.tree.map(partial(turning, spin), replace(strikes, a=(), b=(), jac=None, mid_jac=None, spin=None))
-    return replace(rows, a=strikes.a[:count], b=strikes.b[:count])
+    plain = replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None, spin=None)
+    a, b, wholes = (of_all[:count] for of_all in (strikes.a, strikes.b, strikes.wholes))
+    return replace(jax.tree.map(partial(turning, spin), plain), a=a, b=b, wholes=wholes)
 
 
 def _about(n: Array, r: Array) -> Array:
@@ -151,7 +153,8 @@ def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array
     def others(values: Any) -> Any:
         return jax.tree.map(lambda leaf: jnp.concatenate([leaf[:count], leaf[2 * count :]]), values)
 
-    free = replace(strikes, v_rel=strikes.v_rel + by_torque, pull=pull, a=(), b=(), jac=None, mid_jac=None, spin=None)
-    a, b = (side[:count] + side[2 * count :] for side in (strikes.a, strikes.b))
-    early = stopping_early(mobility, replace(others(free), a=a, b=b), others(P), others(law), others(T))
+    plain = replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None, spin=None)
+    free = others(replace(plain, v_rel=strikes.v_rel + by_torque, pull=pull))
+    a, b, wholes = (of_all[:count] + of_all[2 * count :] for of_all in (strikes.a, strikes.b, strikes.wholes))
+    early = stopping_early(mobility, replace(free, a=a, b=b, wholes=wholes), others(P), others(law), others(T))
     return jnp.concatenate([early[:count], jnp.zeros_like(turning(spin, P)), early[count:]])

@@ -236,13 +236,13 @@ def between_bodies(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> tuple
 
 
 @functools.cache
-def same_bodies(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
-    """For each of C contacts, those between the same two colliders, itself included, padded by C; (C, most)."""
-    members: dict[tuple[int, int], list[int]] = {}
-    for contact, pair in enumerate(zip(a, b, strict=True)):
-        members.setdefault(pair, []).append(contact)
+def alike(labels: tuple) -> tuple[tuple[int, ...], ...]:
+    """For each of C contacts, those with the same label, itself included, padded by C; (C, most)."""
+    members: dict[Any, list[int]] = {}
+    for contact, label in enumerate(labels):
+        members.setdefault(label, []).append(contact)
     most = max(map(len, members.values()))
-    return tuple(tuple(m + [len(a)] * (most - len(m))) for m in (members[pair] for pair in zip(a, b, strict=True)))
+    return tuple(tuple(members[label] + [len(labels)] * (most - len(members[label]))) for label in labels)
 
 
 def at_colliders(values: Array, colliders: tuple[int, ...], fill: float) -> Array:

@@ -10,7 +10,7 @@ from jax import Array
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, momentum_changes
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.sides import at_colliders, same_bodies
+from diffrigid.contact.sides import alike, at_colliders
 from diffrigid.gathers import constant, sum_rows
 from diffrigid.numerics import dot, norm, safe_divide
 from diffrigid.pytree import replace
@@ -99,20 +99,21 @@ def lost_to_stops(
         most_to_stop: (C, *batch) [N s] the friction that can have stopped the slip. All other holds against what does
             not slip, as that at a corner about which a body turns.
     """
-    together = same_bodies(strikes.a, strikes.b)
-
-    def in_all(values: Array) -> Array:  # over the contacts of the same two bodies, which slip as one
-        return sum_rows(values, together)
-
+    together = alike(strikes.wholes)
     speed, at_end_speed = (jax.vmap(norm)(r) for r in (slip, at_end))
-    # Against the slip: what contacts of the same two bodies do against each other stops nothing.
+    slipping = speed > least_slip(T.dtype)
+
+    def in_all(values: Array) -> Array:  # over the contacts of two rigid wholes that slip, which they do as one
+        return sum_rows(jnp.where(slipping, values, 0.0), together)
+
+    # Against the slip: what contacts of the same two wholes do against each other stops nothing.
     own = -jax.vmap(dot)(friction, at_end / jnp.where(at_end_speed > 0, at_end_speed, 1.0)[:, None])
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
     size, bound = jnp.abs(in_all(own)), in_all(bounds)
     most = jnp.minimum(size, most_to_stop)
     own, size = own * safe_divide(most, size), most
     whole = at_end_speed * bound + size * (speed - along)
-    stops = strikes.active & (size < STICKS * bound) & (T > 0) & (speed > least_slip(T.dtype))
+    stops = strikes.active & slipping & (size < STICKS * bound) & (T > 0)
     least = float(jnp.finfo(T.dtype).tiny) ** 0.5  # the derivative of a quotient divides by the square of this
     stops = stops & (at_end_speed > least) & (whole > least)
     share = safe_divide(speed * size, jnp.where(stops, whole, 0.0))  # tau / T

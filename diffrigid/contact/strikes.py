@@ -22,6 +22,7 @@ from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, 
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
 from diffrigid.gathers import constant, rows
+from diffrigid.joints import Weld
 from diffrigid.linkage import islands
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
@@ -59,7 +60,7 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
         jacs = {"jac": stops.jac, "mid_jac": stops.mid_jac}
         mid = stops.arm_a if is_loaded(world) else None
         parts.append(replace(stops, jac=None, mid_jac=None, mid_a=mid, mid_b=mid))
-    return replace(_joined(parts), **ends(world), **jacs)
+    return replace(_joined(parts), **ends(world), wholes=wholes(world), **jacs)
 
 
 def _joined(parts: list[Strikes]) -> Strikes:
@@ -178,6 +179,18 @@ def ends(world: Any) -> dict[str, tuple[int, ...]]:
 
     a, b = column(lambda pairs: pairs.a), column(lambda pairs: pairs.b)
     return {"a": a + stop_ends(world, "a"), "b": b + stop_ends(world, "b")}
+
+
+def wholes(world: Any) -> tuple:
+    """Of every contact and row, which two rigid wholes it is between: what is welded is one, and so are the statics."""
+    moving, count, pairs = len(world.names), contact_count(world), ends(world)
+    whole = [min(body) for body in islands(tuple(g for g in world.joints if isinstance(g, Weld)), moving)]
+
+    def label(ends: tuple[int, int]) -> tuple:
+        return tuple(sorted(whole[i] if i < moving else moving for i in ends))
+
+    both = list(zip(pairs["a"], pairs["b"], strict=True))
+    return tuple(map(label, both[:count])) + tuple(("joint", *ends) for ends in both[count:])
 
 
 @pytree

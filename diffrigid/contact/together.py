@@ -36,7 +36,7 @@ from diffrigid.linear import solve_regular
 from diffrigid.numerics import FOUND, dot, norm, safe_divide
 from diffrigid.pytree import array, pytree, replace, static
 
-ROUNDS = 40  # at most, of Newton's method
+ROUNDS = 60  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
 ROUGH = 1e-2  # with this relative error, and then with as little as it can
 PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
@@ -197,7 +197,8 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     z, r = _missing(P, *given)
 
     def smoothed(P, *_):
-        P = _smoothed(P, *given)
+        before = jnp.where(now.since == PATIENCE, now.best, now.P)
+        P = _smoothed(jnp.where(now.since >= PATIENCE, before, P), *given)
         return P, *_missing(P, *given)
 
     poor = _lacks(cone, now) & (_speed(cone, r) > LITTLE * now.error)
