@@ -42,7 +42,11 @@ def gaps(a: Side, pose_a: Pose, b: Side, pose_b: Pose) -> tuple[np.ndarray, np.n
     if a.corners.shape[2] == 2:
         found = [(b, _on_sides(corners_a, corners_b, b.sides)), (a, _on_sides(corners_b, corners_a, a.sides))]
     else:
-        found = [(b, _crossing(corners_a, a.sides, corners_b, b.sides))]
+        crossing, foot, top = _crossing(corners_a, a.sides, corners_b, b.sides)
+        if a.faces and b.faces:  # else the cores do not enter each other
+            inside = _inside(foot, corners_a, a.faces, _inside(top, corners_b, b.faces, np.full(crossing.shape, True)))
+            crossing = np.where(inside, -crossing, crossing)
+        found = [(b, (crossing, foot, top))]
         found += [(b, _on_faces(corners_a, corners_b, b.faces))] if b.faces else []
         found += [(a, _on_faces(corners_b, corners_a, a.faces))] if a.faces else []
     rounding, parts = (a.rounding + b.rounding)[:, None], []
@@ -90,9 +94,7 @@ def _on_sides(corners: np.ndarray, others: np.ndarray, sides: tuple):
 
 def _on_faces(corners: np.ndarray, others: np.ndarray, faces: tuple):
     """Of each corner and the nearest face that it stands over in 3D; an infinite distance if over none."""
-    p, r, s = (others[:, [face[n] for face in faces]] for n in range(3))
-    normal = np.cross(r - p, s - p)
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-30)
+    (p, r, s), normal = _planes(others, faces)
     height = ((corners[:, :, None] - p[:, None]) * normal[:, None]).sum(3)
     foot = corners[:, :, None] - height[..., None] * normal[:, None]
     over = np.ones(height.shape, bool)
@@ -105,6 +107,23 @@ def _on_faces(corners: np.ndarray, others: np.ndarray, faces: tuple):
     nearest = gap.argmin(2)[..., None]
     least = np.take_along_axis(gap, nearest, 2)[..., 0] * np.where(inside[..., 0], -1.0, 1.0)
     return least, np.take_along_axis(foot, nearest[..., None], 2)[:, :, 0], corners
+
+
+def _planes(corners: np.ndarray, faces: tuple) -> tuple[list[np.ndarray], np.ndarray]:
+    """Corners of faces (M, F, 3), three for each, and their normals (M, F, 3)."""
+    p, r, s = (corners[:, [face[n] for face in faces]] for n in range(3))
+    normal = np.cross(r - p, s - p)
+    return [p, r, s], normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-30)
+
+
+def _inside(points: np.ndarray, corners: np.ndarray, faces: tuple, asked: np.ndarray) -> np.ndarray:
+    """Which of the points (M, C, 3) that are `asked` (M, C) are inside a shape, bool (M, C)."""
+    row, column = np.nonzero(asked)
+    (on, *_), normal = _planes(corners, faces)
+    height = ((points[row, column][:, None] - on[row]) * normal[row]).sum(2)
+    inside = np.zeros_like(asked)
+    inside[row, column] = (height < 0).all(1)
+    return inside
 
 
 def _crossing(corners_a: np.ndarray, sides_a: tuple, corners_b: np.ndarray, sides_b: tuple):

@@ -152,6 +152,26 @@ def test_impulse_between_two_bodies_is_found_at_corner_edge_and_round(dim):
         np.testing.assert_allclose(table[:, 2].mean(), 0.0035, atol=1e-3)
 
 
+@pytest.mark.parametrize("step", [0.01, 0.1])
+def test_impulse_of_edge_on_edge(step):
+    """Cubes on edges that cross at right angles: they are found also where the free flight goes deep into the other."""
+    reach, c = 0.1 * np.sqrt(2.0), float(np.cos(np.pi / 8))
+    turned = [(c, 0.0, float(np.sin(np.pi / 8)), 0.0), (c, 0.0, 0.0, float(np.sin(np.pi / 8)))]  # about y, about z
+    places = [(-reach, 0.0, 0.0), (reach + 0.35 * step, 0.0, 0.0)]
+    cube = dr.Box(half=(0.1, 0.1, 0.1))
+    world, state = dr.scene(
+        {n: dr.Body(cube, mass=1.0, x=x, q=q) for n, x, q in zip("ab", places, turned, strict=True)}
+    )
+    along, x0 = np.eye(3)[0], np.asarray(state.x)
+    x1 = x0 + step * np.array([[0.35], [0.65]]) * along
+    v0, v1 = np.array([along, 0 * along]), np.array([0 * along, along])
+    run = trajectory(world, [0.0, step], [x0, x1], np.stack([state.q, state.q]), [v0, v1], np.zeros((2, 2, 3)))
+    (impact,) = contacts(run, run.t)
+    np.testing.assert_allclose(impact[:2], [0.35 * step, 1.0], atol=1e-3 * step)
+    np.testing.assert_allclose(impact[2:5], [0.35 * step, 0.0, 0.0], atol=1e-3 * step)
+    np.testing.assert_allclose(np.abs(impact[5:]), along, atol=1e-6)
+
+
 def test_energy_of_a_fall_is_constant_until_the_impact():
     run = bounce()
     kinetic, potential, total = energies(run.world, run.state).T
