@@ -101,3 +101,8 @@ def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]
 def constant(table: tuple, dtype: str) -> np.ndarray:
     """A tuple, or a tuple of tuples, as an array that is made once; see `rows`."""
     return np.array(table, dtype)
+
+
+def flags(values: tuple[bool, ...], like: Array) -> Array:
+    """Flags that are known when tracing as an array with the batch axes of `like`, (C, 1, ...)."""
+    return jnp.asarray(constant(values, "bool")).reshape(len(values), *[1] * (like.ndim - 1))

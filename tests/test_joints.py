@@ -170,6 +170,25 @@ def test_hinged_rod_rebounds():
     assert_allclose(slopes, jax.grad(expected, (0, 1, 2))(*p), atol=1e-8)
 
 
+def test_a_joint_of_others_changes_nothing():
+    """A box that strikes the floor with a corner, and slides there, does the same beside two bodies with a joint."""
+    q = jnp.array([0.95, 0.2, 0.15, 0.1])
+    box = dr.Box(half=(0.3, 0.2, 0.1))
+    thrown = dr.Body(box, mass=1.0, x=(0.0, 0.0, 0.3), q=q / jnp.linalg.norm(q), v=(2.0, 0.5, -1.0), w=(1.0, 2.0, 3.0))
+    others = {
+        name: dr.Body(None, mass=1.0, inertia=jnp.eye(3), x=(x, 0.0, 5.0)) for name, x in (("b", 0.0), ("c", 1.0))
+    }
+    bodies = {"a": thrown, "floor": dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0))), **others}
+    velocities = []
+    for joints in ([], [dr.Ball("b", "c", anchor_a=(0.5, 0.0, 0.0))]):
+        world, state = dr.scene(bodies, gravity=(0.0, 0.0, -G), friction=0.2, joints=joints)
+        after = dr.step(world, state, 0.05)
+        velocities.append(jnp.concatenate([after.v[0], after.w[0]]))
+    alone, beside = velocities
+    assert alone[2] > -1.0  # struck
+    assert_allclose(beside, alone, atol=1e-4)  # the free motion is integrated where there are joints
+
+
 def test_an_arm_falls_on_the_floor_and_rests():
     """Two boxes and a hinge: the hinge holds, and energy never rises by more than to lift them by g dt^2 / 8.
 

@@ -21,7 +21,7 @@ from diffrigid.contact.sides import side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
-from diffrigid.linkage import Linkage, islands, linkage, spread
+from diffrigid.linkage import Linkage, ends_of, islands, linkage, spread
 from diffrigid.pytree import replace
 from diffrigid.state import State, rotations
 
@@ -113,7 +113,8 @@ def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility, Linka
     q, so = jax.vmap(orientation)(flight, t), rotations(flight.dim)
     if world.joints:
         link = linkage(world.joints, world.statics, world.bodies, jax.vmap(position)(flight, t), q)
-        return q, jointed(link, jax.vmap(so.world_inverse)(world.bodies.inertia, q)), link
+        joined = frozenset(end for ends in ends_of(world.joints) for end in ends if end < len(q))
+        return q, jointed(link, jax.vmap(so.world_inverse)(world.bodies.inertia, q), joined), link
     inverse = jax.vmap(so.world_inverse)(flight.inverse_inertia, q)
     return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse), None
 

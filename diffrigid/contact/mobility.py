@@ -47,6 +47,7 @@ class Mobility:
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
     matrix: Any = array("R", "R", default=None)  # G whole, where there are joints: twists (D + A) of body after body
     inertia: Any = None  # [kg m^2] world axes; with `matrix` only
+    joined: frozenset[int] = static(default=frozenset())  # bodies that have a joint
 
 
 def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
@@ -86,8 +87,11 @@ def _joined(parts: list[Array]) -> Array:
     return jnp.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
-def jointed(link: Linkage, inertia: Array) -> Mobility:
-    """Of bodies with joints, and inertias in world axes. G is used so often that it is made once, column by column."""
+def jointed(link: Linkage, inertia: Array, joined: frozenset[int]) -> Mobility:
+    """Of bodies some of which are `joined`, with inertias in world axes.
+
+    G is used so often that it is made once, column by column.
+    """
     moving, *batch = link.inverse_mass.shape
     D, size = link.groups[0].a.x.shape[1], link.sides.shape[3]
     units = jnp.eye(moving * size, dtype=inertia.dtype).reshape(-1, moving, size, *[1] * len(batch))
@@ -99,7 +103,7 @@ def jointed(link: Linkage, inertia: Array) -> Mobility:
         more = spread(link, dv, dw)
         return jnp.concatenate([dv + more[0], dw + more[1]], axis=1).reshape(-1, *batch)
 
-    return replace(free, inertia=inertia, matrix=jax.vmap(twist, out_axes=1)(units))
+    return replace(free, inertia=inertia, matrix=jax.vmap(twist, out_axes=1)(units), joined=joined)
 
 
 @jax.jit

@@ -43,7 +43,7 @@ from diffrigid.contact.strikes import (
     waits,
 )
 from diffrigid.flight import Flight, state_at
-from diffrigid.gathers import constant
+from diffrigid.gathers import flags
 from diffrigid.numerics import FOUND, dot, safe_divide, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
@@ -101,7 +101,7 @@ class Contact:
     def _passes(self, world: Any, start: Anchors, launch: Callable, dt: Array, near: Array) -> Anchors:
         """The anchors after all passes; there are none unless some pair is `near`, a bool."""
         always = driven(world)  # what acts in every step, and needs no impact before
-        resting = jnp.broadcast_to(_flags(always, start.t0), (len(always), *start.t0.shape[1:]))
+        resting = jnp.broadcast_to(flags(always, start.t0), (len(always), *start.t0.shape[1:]))
 
         # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches.
         @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
@@ -191,7 +191,7 @@ def _demanded(
     Struck is a contact whose turn it is: its normal velocity is to be restitution times that of closing, or 0 if it
     comes to rest. Held is one that rests: it is not to close, but may where its gap is open.
     """
-    push, drives = phase == PUSH, _flags(driven(world), dt[None])
+    push, drives = phase == PUSH, flags(driven(world), dt[None])
     u, closing = (-jax.vmap(dot)(strikes.normal, motion) for motion in (strikes.v_rel, strikes.pull))
     restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
     if world.bodies.restitution_falloff is not None:
@@ -222,7 +222,7 @@ def _held(
         stays: which would come to rest if they were struck now.
         fallen: which close no faster than after a step of free fall, so that they rested before it.
     """
-    impact, drives = phase == IMPACT, _flags(driven(world), resting)
+    impact, drives = phase == IMPACT, flags(driven(world), resting)
     held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | fallen)
     slow = -jax.vmap(dot)(strikes.normal, strikes.v_rel) <= world.contact.rest_speed[None]
     comes = strikes.active & ~strikes.held & (slow | (strikes.now & stays))
@@ -239,8 +239,3 @@ def _fallen(world: Any, flight: Flight, closing: Array, dt: Array) -> Array:
 def _choice(chosen: Array, new: Any, old: Any) -> Any:
     """By world, or for all of them: (*batch) or (), and two trees."""
     return jax.tree.map(lambda a, b: jnp.where(jnp.broadcast_to(chosen, a.shape), a, b), new, old)
-
-
-def _flags(flags: tuple[bool, ...], like: Array) -> Array:
-    """Flags of contacts as an array with the batch axes of `like`, (C, 1, ...)."""
-    return jnp.asarray(constant(flags, "bool")).reshape(len(flags), *[1] * (like.ndim - 1))

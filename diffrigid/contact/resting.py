@@ -11,6 +11,7 @@ from diffrigid.contact.gain import solve_without_gain
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sides import at_colliders
+from diffrigid.gathers import flags
 from diffrigid.numerics import safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static
 
@@ -59,8 +60,8 @@ def solve_impulses(
 ) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
-    A contact that is alone on its bodies has its own law, `contact_law`. Others are solved together, `together.py`,
-    which is not even compiled for a world where all are always alone, as one disc over a floor.
+    A contact that is alone on its bodies, which have no joints, has its own law, `contact_law`. Others are solved
+    together, `together.py`. What a world never has is not even compiled, as the latter for one disc over a floor.
 
     Args:
         count: (N, *batch) number of active contacts of each body.
@@ -68,15 +69,17 @@ def solve_impulses(
         guess: (C, D, *batch) [N s] impulses that a solution of many may be near to.
     """
     target, mu, most = law
-    if mobility.matrix is None and are_alone(strikes.a, strikes.b, len(count)):
+    if not mobility.joined and are_alone(strikes.a, strikes.b, len(count)):
         return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu)
+    joined = tuple(not mobility.joined.isdisjoint(pair) for pair in zip(strikes.a, strikes.b, strict=True))
     others = jnp.maximum(at_colliders(count, strikes.a, 1.0), at_colliders(count, strikes.b, 1.0))
     others = lax.stop_gradient(others)
-    shared = strikes.active & ((others > 1) | (mobility.matrix is not None))
-    by_itself = strikes.active & ~shared
-    alone = lax.cond(
-        any_world(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu
-    )
+    shared = strikes.active & ((others > 1) | flags(joined, count))
+    by_itself, alone = strikes.active & ~shared, jnp.zeros_like(strikes.v_rel)
+    if not all(joined):
+        alone = lax.cond(
+            any_world(by_itself), impulses, _none, by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu
+        )
     cone = Cone(
         on=shared.astype(others.dtype), sharing=jnp.maximum(others, 1.0), scale=_scale(strikes), normal=strikes.normal,
         target=target, mu=mu, most=most, spin=strikes.spin, rest_speed=rest_speed,

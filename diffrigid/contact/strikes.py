@@ -21,7 +21,7 @@ from diffrigid.contact.sides import Side, began, centre, contacts_of, place, rea
 from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
-from diffrigid.gathers import constant, rows
+from diffrigid.gathers import constant, flags, rows
 from diffrigid.joints import Weld
 from diffrigid.linkage import islands
 from diffrigid.numerics import dot, norm
@@ -258,7 +258,7 @@ def driving(world: Any, target: Array) -> tuple[Array, Array | None]:
     """`target` with the speeds of motors put in, and the most that friction and motors do [N or N m]; None: no such."""
     if not any(is_drive(world)):
         return target, None
-    drives = jnp.asarray(constant(is_drive(world), "bool")).reshape(-1, *[1] * (target.ndim - 1))
+    drives = flags(is_drive(world), target)
     speed, force = (of_stops(world, name, ("friction",), 0.0, target.shape[1:]) for name in ("speed", "friction"))
     points = contact_count(world)
     target = jnp.concatenate([target[:points], jnp.where(drives, speed, target[points:])])
