@@ -84,14 +84,13 @@ def reversing(
         stops = held & (against > least_slip(T.dtype))
         # How all of the bound brakes the slip, by what those impulses do, if that tells: where friction at all contacts
         # is about along it, and brakes as much as the heaviest mass allows.
-        aside, strength = (in_all(jax.vmap(norm)(r)) for r in (rubbed + own[:, None] * back, rubbed))
-        rubs, rounding = in_all(own), jnp.finfo(T.dtype).eps ** 0.5
-        tells = stops & (jnp.abs(rubs) > TELLS * aside) & (jnp.abs(rubs) > rounding * strength)
+        rubs, bound, aside = (in_all(r) for r in (own, bounds, jax.vmap(norm)(rubbed + own[:, None] * back)))
+        tells = stops & (jnp.abs(rubs) > TELLS * aside + jnp.finfo(T.dtype).eps ** 0.5 * bound)
         per_impulse = safe_divide(braked, jnp.where(tells, rubs, 0.0))
         light = per_impulse * heaviest > TELLS
         if law.most is not None:
             light = light | jnp.isfinite(law.most)
-        drag = jnp.where(light, in_all(bounds) * per_impulse, 0.0)
+        drag = jnp.where(light, bound * per_impulse, 0.0)
         turns = stops & (drag > 0) & (pull > drag) & (against < pull + drag)
         share = safe_divide(against, jnp.where(turns, pull + drag, 0.0))[:, None]
         after = jnp.where(turns[:, None], -bounds[:, None] * back, 0.0)

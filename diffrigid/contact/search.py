@@ -226,15 +226,14 @@ def _polish(
         height = gap - level[None]
         there = (jnp.abs(height) <= 8.0 * slack**2 * size[None]) & (v < 0)  # to rounding
         dt = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
-        ahead = jnp.isfinite(dt) & ((dt < 0) | (s < t1 + slack * span))  # what is later is no impact
-        dt = jnp.where(ahead, dt, 0.0)
-        at_level = ((gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0)) & ~rests).any(0)
-        # Where it converges the gap is closed by the last step, which may be wider than the slack of the gap.
-        at_level = at_level | (ahead & (jnp.abs(dt) <= slack * span))
+        dt = jnp.where(jnp.isfinite(dt) & ((dt < 0) | (s < t1 + slack * span)), dt, 0.0)  # what is later is no impact
+        at_level = (gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0)) & ~rests
         inside = jnp.where(count == 0, ((gap <= level[None]) & (v < 0) & ~rests).any(0), inside)
-        return count + 1, s + dt, dt, at_level, inside
+        return count + 1, s + dt, dt, at_level.any(0), inside
 
-    _, s, _, found, inside = lax.while_loop(busy, towards, (0, s, jnp.inf + s, s < s, s < s))
+    _, s, dt, found, inside = lax.while_loop(busy, towards, (0, s, jnp.inf + s, s < s, s < s))
+    # Where it converges the last step closes the gap, which at its start may have been wider than the slack.
+    found = found | ((dt != 0) & (jnp.abs(dt) <= slack * span))
     return jnp.where(found, s, near), found | inside
 
 
