@@ -306,7 +306,7 @@ def test_second_derivatives_through_an_impact_are_an_error():
 
 def test_friction_of_rounding_has_finite_slopes():
     """In float32, without friction: quotients of what is left of it, whose squares are below the least number."""
-    pair = SimpleNamespace(a=(0,), b=(1,), active=jnp.array([True]))
+    pair = SimpleNamespace(wholes=("pair",), active=jnp.array([True]))
     slip, at_end, friction = (jnp.full((1, 2), size, jnp.float32) for size in (1e-3, 0.9e-3, 1e-16))
     arguments = jnp.full(1, 4e-3, jnp.float32), slip, at_end, friction, jnp.zeros(1, jnp.float32)
     lost, back = jax.vjp(functools.partial(lost_to_stops, pair, most_to_stop=jnp.ones(1, jnp.float32)), *arguments)
