@@ -18,9 +18,7 @@ from diffrigid.branches import any_world
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.sides import alike
-from diffrigid.contact.slipping import least_slip, most_resisting, rubbing, slips
-from diffrigid.gathers import sum_rows
+from diffrigid.contact.slipping import in_all, least_slip, most_resisting, rubbing, slips
 from diffrigid.numerics import dot, norm, normalise, safe_divide
 from diffrigid.pytree import array, pytree, replace
 
@@ -70,11 +68,7 @@ def reversing(
     held, heaviest = strikes.active & strikes.held & (T > 0), most_resisting(mobility, strikes)
 
     def found(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
-        (friction, bounds), together = rubbing(strikes, P, law), alike(strikes.wholes)
-
-        def in_all(values: Array) -> Array:  # over the contacts of two rigid wholes that slip, which they do as one
-            return sum_rows(jnp.where(stops, values, 0.0), together)
-
+        friction, bounds = rubbing(strikes, P, law)
         at_end, slip = slips(friction, strikes, law.target, T)
         pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
         rubbed = friction(P)
@@ -84,7 +78,8 @@ def reversing(
         stops = held & (against > least_slip(T.dtype))
         # How all of the bound brakes the slip, by what those impulses do, if that tells: where friction at all contacts
         # is about along it, and brakes as much as the heaviest mass allows.
-        rubs, bound, aside = (in_all(r) for r in (own, bounds, jax.vmap(norm)(rubbed + own[:, None] * back)))
+        across = jax.vmap(norm)(rubbed + own[:, None] * back)
+        rubs, bound, aside = (in_all(strikes, stops, part) for part in (own, bounds, across))
         tells = stops & (jnp.abs(rubs) > TELLS * aside + jnp.finfo(T.dtype).eps ** 0.5 * bound)
         per_impulse = safe_divide(braked, jnp.where(tells, rubs, 0.0))
         light = per_impulse * heaviest > TELLS

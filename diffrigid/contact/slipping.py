@@ -89,6 +89,11 @@ def least_slip(dtype: Any) -> float:
     return max(CREEP, float(jnp.finfo(dtype).eps) ** 0.5)
 
 
+def in_all(strikes: Any, slipping: Array, values: Array) -> Array:
+    """Sums (C, *batch) over the contacts of the same two rigid wholes that are `slipping`, which they do as one."""
+    return sum_rows(jnp.where(slipping, values, 0.0), alike(strikes.wholes))
+
+
 def lost_to_stops(
     strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array, most_to_stop: Array
 ) -> Array:
@@ -99,17 +104,12 @@ def lost_to_stops(
         most_to_stop: (C, *batch) [N s] the friction that can have stopped the slip. All other holds against what does
             not slip, as that at a corner about which a body turns.
     """
-    together = alike(strikes.wholes)
     speed, at_end_speed = (jax.vmap(norm)(r) for r in (slip, at_end))
     slipping = speed > least_slip(T.dtype)
-
-    def in_all(values: Array) -> Array:  # over the contacts of two rigid wholes that slip, which they do as one
-        return sum_rows(jnp.where(slipping, values, 0.0), together)
-
     # Against the slip: what contacts of the same two wholes do against each other stops nothing.
     own = -jax.vmap(dot)(friction, at_end / jnp.where(at_end_speed > 0, at_end_speed, 1.0)[:, None])
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
-    size, bound = jnp.abs(in_all(own)), in_all(bounds)
+    size, bound = jnp.abs(in_all(strikes, slipping, own)), in_all(strikes, slipping, bounds)
     most = jnp.minimum(size, most_to_stop)
     own, size = own * safe_divide(most, size), most
     whole = at_end_speed * bound + size * (speed - along)

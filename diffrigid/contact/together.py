@@ -39,10 +39,10 @@ from diffrigid.pytree import array, pytree, replace, static
 ROUNDS = 60  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
 ROUGH = 1e-2  # with this relative error, and then with as little as it can
-PILE = 4  # bodies; with fewer it was never seen to go in circles, and need not compile the other method
+PILE = 4  # bodies; with fewer it is enough to go back to the best, and the other method need not be compiled
 SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little
 LITTLE = 0.9  # of the error before: a step that leaves more gained little
-PATIENCE = 3  # rounds that do not halve a small error: then it is rounding
+PATIENCE = 3  # rounds that do not halve the error: then a small one is rounding, and else the best is smoothed
 # The power of the spacing of numbers that e is. A step leaves an error of relative size e / least eigenvalue of W / k,
 # which for a tower is 1e-4 and less, and one of rounding / e.
 SMALLNESS = 0.55
@@ -187,7 +187,8 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     """A Newton step, from which P is brought back into the cones.
 
     Where that gains little, P is made smoother by some rounds in which each contact takes a share of the
-    masses of its bodies (Tonge et al. 2012). Without both, P may go round in circles.
+    masses of its bodies (Tonge et al. 2012); where that does not help, it is the best P that is made smoother. Without
+    both, P may go round in circles.
     """
     cone, v_rel, arms, mobility = given
     slope = _slope(cone, now.z)
