@@ -6,11 +6,12 @@ goes from there, with t = s - t0 and T its whole duration:
     x(s) = x + v t + a t^2 / 2 + jerk t^3 / 6        exact under a constant force
     v(s) = v + a t + jolt t^2 / 2
     L(s) = L + tau t + twist t^2 / 2                 world axes; L is kept, not w (3D: w wanders)
-    q(s) = q o exp(sum_k turn[k] t^(k+1))            exponential map
+    q(s) = exp(carry t) o q o exp(sum_k turn[k] t^(k+1))    exponential map
 
-A constant force has none of jerk, jolt and twist, and `turn_series` for the rotation. Forces that vary, and those
-of joints, are integrated by the classical rule of Runge and Kutta, in the rotation vector for the orientation
-(Munthe-Kaas 1998): fourth order. Then jerk, jolt, twist and turn are those of the curves that end where it ends.
+A constant force has none of jerk, jolt and twist, and `free_turn` for the rotation, or `turn_series` with a torque.
+Forces that vary, and those of joints, are integrated by the classical rule of Runge and Kutta, in the rotation vector
+for the orientation (Munthe-Kaas 1998): fourth order. Then jerk, jolt, twist and turn are those of the curves that end
+where it ends.
 """
 
 from typing import Any
@@ -19,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import any_world
 from diffrigid.forces import is_constant, total_wrench
 from diffrigid.linkage import joint_wrench
 from diffrigid.numerics import safe_divide
@@ -40,7 +42,8 @@ class Flight:
     jerk: Array | None = array("N", "D", default=None)  # [m/s^3]; None: constant forces
     jolt: Array | None = array("N", "D", default=None)  # [m/s^3]
     twist: Array | None = array("N", "A", default=None)  # [N m/s]
-    turn: Array = array("N", "K", "A")  # [rad/s, rad/s^2, ...]
+    carry: Array | None = array("N", "A", default=None)  # [rad/s] world axes; None: 2D, or torques
+    turn: Array = array("N", "K", "A")  # [rad/s, rad/s^2, ...] body axes
     inverse_mass: Array = array("N")  # [1/kg]
     inverse_inertia: Array = array(lambda f: ("N",) if f.dim == 2 else ("N", "D", "D"))
     dim: int = static()
@@ -55,10 +58,13 @@ def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Fli
     L = spin(bodies, state)
     still = Wrench(F=jnp.zeros_like(state.v), tau=None)  # until the stages of Runge-Kutta
     wrench = still if varies else total_wrench(world.forces, bodies, state, controls)
+    if wrench.tau is None:
+        carry, turn = jax.vmap(so.free_turn)(inverse, state.q, L, t1[None] - t0)
+    else:
+        carry, turn = None, jax.vmap(so.turn_series)(inverse, state.q, L, wrench.tau)
     flight = Flight(
         t0=t0, x=state.x, q=state.q, v=state.v, L=L, a=wrench.F / bodies.mass[:, None], tau=wrench.tau,
-        turn=jax.vmap(so.turn_series)(inverse, state.q, L, wrench.tau), inverse_mass=1.0 / bodies.mass,
-        inverse_inertia=inverse, dim=bodies.dim,
+        carry=carry, turn=turn, inverse_mass=1.0 / bodies.mass, inverse_inertia=inverse, dim=bodies.dim,
     )  # fmt: skip
     if not varies:
         return flight
@@ -134,11 +140,11 @@ def _along(f: Flight, first: Motion, mean: Motion, early: Array, last: Array, T:
     f = replace(
         f, a=first.v, jerk=safe_divide(3.0 * (early - first.v), T), jolt=safe_divide(2.0 * (mean.v - first.v), T)
     )
-    if not has_torque:  # then L is kept, and the series is better
+    if not has_torque:  # then L is kept, and `free_turn` is better
         return f
     bend = safe_divide(3.0 * mean.phi - 2.0 * first.phi - last, T)
     turn = jnp.stack([first.phi, bend, safe_divide(first.phi + last - 2.0 * mean.phi, T**2)], axis=1)
-    return replace(f, tau=first.L, twist=safe_divide(2.0 * (mean.L - first.L), T), turn=turn)
+    return replace(f, tau=first.L, twist=safe_divide(2.0 * (mean.L - first.L), T), carry=None, turn=turn)
 
 
 @jax.jit
@@ -156,7 +162,11 @@ def orientation(f: Flight, s: Array) -> Array:
     phi = f.turn[-1]
     for k in range(f.turn.shape[0] - 2, -1, -1):
         phi = f.turn[k] + t * phi
-    return so.turn_in_body(f.q, t * phi)
+    within = so.turn_in_body(f.q, t * phi)
+    if f.carry is None:
+        return within
+    carried = any_world(f.carry != 0)  # in a world of balls and cubes nothing is
+    return lax.cond(carried, so.turn_by, lambda _, q: q, t * f.carry, within)
 
 
 @jax.jit

@@ -103,6 +103,7 @@ def cos_sin(phi: Array) -> tuple[Array, Array]:
     r = phi
     for part in parts:
         r = r - turns * part
+    r = jnp.clip(r, -0.8, 0.8)  # beyond those turns the phase is lost, but not the length
     square = r * r
     cosine, sine = jnp.ones_like(r), jnp.ones_like(r)
     for k in range(4 if phi.dtype == jnp.float32 else 8, 0, -1):

@@ -121,6 +121,12 @@ def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
     return jnp.stack([w, jnp.zeros_like(w) if tau is None else 0.5 * inverse[None] * tau])
 
 
+def free_turn(inverse: Array, q: Array, L: Array, span: Array) -> tuple[None, Array]:
+    """`turn_series` without a torque. In space there is what carries the body as well."""
+    del span
+    return None, turn_series(inverse, q, L, None)
+
+
 def turn_rate(phi: Array, w: Array) -> Array:
     """Rate of the rotation vector phi since q0 where the body turns with w in its own axes, (1, *batch) [rad/s]."""
     del phi

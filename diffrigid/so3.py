@@ -4,7 +4,6 @@ Orientation q = unit quaternion (w, x, y, z), (4, *batch), body to world; in cod
 `w` stays the angular velocity. Vectors, angular velocities and momenta (3, *batch); inertia (3, 3, *batch).
 """
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -13,10 +12,11 @@ from jax import Array, lax
 
 from diffrigid.branches import any_world
 from diffrigid.gathers import fold
-from diffrigid.numerics import components, cos_sin, dot, safe_sqrt
+from diffrigid.numerics import components, cos_sin, dot, normalise, safe_divide, safe_sqrt
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
+RESOLVED = 2.0  # [rad] of a turn within a step that the series resolves; see free_turn
 
 
 @jax.jit
@@ -174,11 +174,92 @@ def mobility(inverse: Array, r: Array, mid: Array) -> Array:
 
 
 @jax.custom_jvp
+def free_turn(inverse: Array, q: Array, L: Array, span: Array) -> tuple[Array, Array]:
+    """Free rotation through a step of length span (*batch) [s]: what carries the body, and what it turns in its axes.
+
+    After time s the orientation is exp(carry s) o q o exp(sum_k turn[k] s^(k+1)), with carry (3, *batch) [rad/s] in
+    world axes and turn (K, 3, *batch) in body axes. L is kept exactly because it is not integrated at all.
+
+    With l = R^T L and any number c, a body of inverse inertia I^-1 is carried by c L, and turns within by
+    u = (I^-1 - c) l, because in Euler's equations l' = l x w the part along l has no effect. With 1/c between the two
+    moments that differ least, u is the spin of a symmetric top about its axis e, constant, and the whole is exact
+    (Goldstein, Classical Mechanics, section 5.6). Else it is `turn_series` of u, with an error of (u s)^7 / 5040.
+    Where u turns by more than RESOLVED within the step, that series would diverge: there the body is the symmetric top
+    whose moment across e is that in the direction of l, so that it also spins right about any principal axis. Its
+    energy is between the least and the most that a turn about e leads to.
+
+    Where all bodies turn about a principal axis, as balls and cubes always do, only the first term is
+    computed. Its derivatives are those of the whole, which other inertias have.
+    """
+    l = unrotate(q, L)
+    w = matrix_product(inverse, l)
+
+    def first(inverse, q, L, span):
+        del inverse, q, L, span
+        return jnp.zeros_like(w), jnp.concatenate([w[None], jnp.zeros((SERIES_ORDER - 1, *w.shape), w.dtype)])
+
+    most, of_l, of_w = (fold(jnp.maximum, jnp.abs(a), 0) for a in (cross(l, w), l, w))
+    wanders = most > 16.0 * jnp.finfo(w.dtype).eps * of_l * of_w
+    return lax.cond(any_world(wanders), _as_top, first, inverse, q, L, span)
+
+
+@free_turn.defjvp
+def _free_turn_jvp(primals, tangents):
+    return jax.jvp(_as_top, primals, tangents)
+
+
+def _as_top(inverse: Array, q: Array, L: Array, span: Array) -> tuple[Array, Array]:
+    """`free_turn` of bodies of any inertia."""
+    e, l = _odd_axis(lax.stop_gradient(inverse)), unrotate(q, L)
+    about = dot(e, matrix_product(inverse, e))
+    c = 0.5 * (inverse[0, 0] + inverse[1, 1] + inverse[2, 2] - about)
+    rest = inverse - c * _eye(c)
+    resolved = _most_turn(*map(lax.stop_gradient, (rest, about - c, l))) * span**2 < RESOLVED**2
+    turn = turn_series(rest, q, jnp.where(resolved, L, 0.0), None)
+    across = lax.stop_gradient(normalise(l - dot(e, l)[None] * e))
+    c = c + jnp.where(resolved, 0.0, dot(across, matrix_product(rest, across)))
+    top = jnp.where(resolved, 0.0, ((about - c) * dot(e, l))[None] * e)
+    return c[None] * L, jnp.concatenate([turn[:1] + top[None], turn[1:]])
+
+
+def _most_turn(rest: Array, k: Array, l: Array) -> Array:
+    """Bound of |u|^2, (*batch), wherever u = rest l wanders: by what does not change.
+
+    rest has the eigenvalues k, d and -d, so that u = (k l1, d l2, -d l3), |u|^2 = k (k l1^2) + d^2 (l2^2 + l3^2), and
+    l . u = k l1^2 + d (l2^2 - l3^2) is constant, as E and |l| are.
+    """
+    d = safe_sqrt(jnp.maximum(0.5 * (sum(dot(row, row) for row in rest) - k**2), 0.0))
+    constant, square = dot(l, matrix_product(rest, l)), dot(l, l)
+    return jnp.abs(k) * (jnp.abs(constant) + d * square) + d**2 * square
+
+
+def _eye(like: Array) -> Array:
+    return jnp.eye(3, dtype=like.dtype).reshape(3, 3, *[1] * like.ndim)
+
+
+def _odd_axis(inverse: Array) -> Array:
+    """Unit vector, body axes, of the principal axis whose moment differs most from the other two; (3, *batch).
+
+    The part of I^-1 without trace has its largest eigenvalue there, as the sum of the other two. Its 64th power has
+    nothing else left but where the moments are about evenly spaced.
+    """
+    trace = inverse[0, 0] + inverse[1, 1] + inverse[2, 2]
+
+    def squared(_, S):
+        S = jax.vmap(matrix_product, (None, 0))(S, S)  # of a symmetric matrix: its rows are its columns
+        return safe_divide(S, (S[0, 0] + S[1, 1] + S[2, 2])[None, None])
+
+    first, second, third = lax.fori_loop(0, 6, squared, 3.0 * inverse / trace - _eye(trace))
+    axis = jnp.where(
+        first[0] >= jnp.maximum(second[1], third[2]), first, jnp.where(second[1] >= third[2], second, third)
+    )
+    return normalise(axis, jnp.broadcast_to(_eye(trace)[2], axis.shape))
+
+
 def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
     """Rotation vector, in body axes, after time s, as a power series sum_k turn[k] s^(k+1); (K, 3, *batch).
 
-    The orientation is q o exp(turn(s)): on the unit sphere whatever the truncation, and L is kept exactly
-    because it is not integrated at all. In body axes, with l = R^T L, t = R^T tau and w = I^-1 l:
+    In body axes, with l = R^T L, t = R^T tau and w = I^-1 l:
 
         l' = l x w + t,    t' = t x w                          (Euler's equations; tau constant in the world)
         turn' = w + turn x w / 2 + turn x (turn x w) / 12      (inverse right Jacobian; Magnus series)
@@ -186,31 +267,7 @@ def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
     Truncated after s^6: the error of one step is of order (w s)^7 / 5040, and none where l is parallel to w.
     Source: Iserles et al., Lie-group methods, Acta Numerica 2000, section 4; Hairer, Lubich, Wanner,
     Geometric Numerical Integration, VII.5.
-
-    Where all bodies turn about a principal axis without torque, as balls and cubes always do, only the first term is
-    computed. Its derivatives are those of the whole series, which other inertias have.
     """
-    if tau is not None:
-        return _whole_series(inverse, q, L, tau)
-    l = unrotate(q, L)
-    w = matrix_product(inverse, l)
-
-    def first(inverse, q, L):
-        del inverse, q, L
-        return jnp.concatenate([w[None], jnp.zeros((SERIES_ORDER - 1, *w.shape), w.dtype)])
-
-    most, of_l, of_w = (fold(jnp.maximum, jnp.abs(a), 0) for a in (cross(l, w), l, w))
-    wanders = most > 16.0 * jnp.finfo(w.dtype).eps * of_l * of_w
-    return lax.cond(any_world(wanders), partial(_whole_series, tau=None), first, inverse, q, L)
-
-
-@turn_series.defjvp
-def _turn_series_jvp(primals, tangents):
-    return jax.jvp(_whole_series, primals, tangents)
-
-
-def _whole_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
-    """Terms of `turn_series`, (K, 3, *batch)."""
     l = unrotate(q, L)
     w = matrix_product(inverse, l)
     drives = [l, w] if tau is None else [l, w, unrotate(q, tau)]

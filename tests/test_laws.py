@@ -295,6 +295,71 @@ def test_asymmetric_top_follows_eulers_equations():
     assert_allclose(own[-1], w_body, atol=3 * TOP)
 
 
+def symmetric_top(p, t):
+    """Orientation of a body with the moments across, across and along, after t: Goldstein, section 5.6."""
+    L = jnp.stack([p["across"], p["across"], p["along"]]) * p["w"]
+    within = (1.0 / p["along"] - 1.0 / p["across"]) * L[2] * jnp.array([0.0, 0.0, 1.0])
+    return so3.compose(so3.exp(t * L / p["across"]), so3.exp(t * within))
+
+
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+def test_a_symmetric_top_is_exact_at_any_spin(jacobian):
+    dt = 1 / 60
+
+    def own(p):
+        inertia = jnp.stack([p["across"], p["across"], p["along"]])
+        world, state = dr.scene({"top": dr.Body(None, mass=1.0, inertia=inertia, x=jnp.zeros(3), w=p["w"])})
+        return dr.rollout(world, state, dt=dt, steps=10).state.q[-1, 0]
+
+    run, closed_form = (
+        jax.jit(lambda p, f=f: (f(p), jacobian(f)(p))) for f in (own, lambda p: symmetric_top(p, 10 * dt))
+    )
+    for along in (0.1, 2.0):
+        p = {"across": jnp.asarray(1.2), "along": jnp.asarray(along), "w": jnp.array([300.0, -100.0, 200.0])}
+        (q, slopes), (expected, true_slopes) = run(p), closed_form(p)
+        assert_allclose(q, expected, atol=1e-11)  # rounding of an angle of 50 rad or more
+        for name, slope in slopes.items():
+            assert_allclose(slope, true_slopes[name], atol=1e-9)
+
+
+def test_what_spins_fast_about_nearly_a_principal_axis_turns_by_its_spin():
+    """By 10 rad in each of ten steps, about each axis of a box of three moments."""
+
+    @jax.jit
+    @jax.vmap
+    def turned(w):
+        body = dr.Body(None, mass=1.0, inertia=(0.5, 0.9, 1.2), x=jnp.zeros(3), w=w)
+        return dr.rollout(*dr.scene({"box": body}), dt=1 / 60, steps=10).state.q[-1, 0]
+
+    w = 600.0 * jnp.eye(3)
+    expected = jax.vmap(so3.exp)(w / 6)
+    assert_allclose(turned(w + 1e-5), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_box_that_turns_far_in_a_step_keeps_its_length_and_about_its_energy(dtype):
+    turns = np.array([0.5, 1.0, 3.0, 10.0, 1e3, 1e4])  # [rad] in a step
+    rng, dt = np.random.default_rng(0), 1 / 60
+    sides = np.exp(rng.uniform(np.log(0.1), 0.0, (64, 3)))
+    w = rng.normal(size=(64, 3))
+    w = turns[:, None, None] / dt * w / np.linalg.norm(w, axis=1, keepdims=True)
+
+    def run(sides, w):
+        inertia = (jnp.sum(sides**2) - sides**2) / 12.0
+        scene = dr.scene({"box": dr.Body(None, mass=1.0, inertia=inertia, x=np.zeros(3), w=w)})
+        world, state = jax.tree.map(lambda leaf: leaf.astype(dtype), scene)
+        states = dr.rollout(world, state, dt=dtype(dt), steps=60).state
+        energy = jax.vmap(lambda state: dr.kinetic_energy(world.bodies, state)[0])(states)
+        return energy / energy[0] - 1.0, states.q[:, 0]
+
+    change, q = jax.jit(jax.vmap(jax.vmap(run), in_axes=(None, 0)))(sides, w)
+    assert change.dtype == dtype
+    assert_allclose(jnp.linalg.norm(q, axis=-1), 1.0, atol=1e-6 if dtype == np.float32 else ROUNDING)
+    change, rounding = np.abs(change).max(axis=2), 5e-5 if dtype == np.float32 else 0.0
+    assert (change.max(1) < np.array([1e-5, 5e-4, 0.7, 0.7, 0.7, 0.7]) + rounding).all()
+    assert (np.median(change, 1) < np.array([1e-5, 1e-5, 0.1, 0.1, 0.1, 0.1]) + rounding).all()
+
+
 # ---- what a collision does to the motion, as a map
 
 

@@ -19,22 +19,33 @@ AXIS = jnp.array([0.48, 0.64, 0.6])  # of the wheel, in its own axes
 
 def wheel(w, dim=2, **along):
     """A wheel on an axle; in space turned at the start, about an axis that is none of the world's nor of the body's."""
-    if dim == 2:
-        body = dr.Body(None, mass=1.0, inertia=INERTIA, x=(0.0, 0.0), w=w)
-        return dr.scene({"wheel": body}, joints=[dr.Revolute("wheel", anchor_a=0.0, **along)])
-    body = dr.Body(None, mass=1.0, inertia=(INERTIA,) * 3, x=(0.0, 0.0, 0.0), q=START, w=w * so3.rotate(START, AXIS))
-    return dr.scene({"wheel": body}, joints=[dr.Revolute("wheel", anchor_a=0.0, axis_a=AXIS, **along)])
+    return wheels({"wheel": (w, along)}, dim)
 
 
-def turned(scene, seconds):
+def wheels(made, dim):
+    """A wheel for every name, of which `made` has the spin [rad/s] and what its hinge is given."""
+    bodies, joints = {}, []
+    for name, (w, along) in made.items():
+        if dim == 2:
+            bodies[name] = dr.Body(None, mass=1.0, inertia=INERTIA, x=(0.0, 0.0), w=w)
+            joints.append(dr.Revolute(name, anchor_a=0.0, **along))
+        else:
+            whole = dict(inertia=(INERTIA,) * 3, x=(0.0, 0.0, 0.0), q=START, w=w * so3.rotate(START, AXIS))
+            bodies[name] = dr.Body(None, mass=1.0, **whole)
+            joints.append(dr.Revolute(name, anchor_a=0.0, axis_a=AXIS, **along))
+    return dr.scene(bodies, joints=joints)
+
+
+def turned(scene, seconds, body=0):
     """Angle turned [rad], and at the end its rate [rad/s] and the whole angular velocity."""
     world, state = scene
     path = dr.rollout(world, state, dt=1 / RATE, steps=round(seconds * RATE)).state
+    q, w = path.q[:, body], path.w[-1, body]
     if world.dim == 2:
-        angle = jnp.arctan2(path.q[:, 0, 1], path.q[:, 0, 0])
+        angle = jnp.arctan2(q[:, 1], q[:, 0])
     else:
-        angle = jnp.sqrt((jax.vmap(so3.log)(jax.vmap(so3.difference, (None, 0))(START, path.q[:, 0])) ** 2).sum(-1))
-    return jnp.unwrap(angle)[-1], jnp.sqrt((path.w[-1, 0] ** 2).sum()), path.w[-1, 0]
+        angle = jnp.sqrt((jax.vmap(so3.log)(jax.vmap(so3.difference, (None, 0))(START, q)) ** 2).sum(-1))
+    return jnp.unwrap(angle)[-1], jnp.sqrt((w**2).sum()), w
 
 
 def check_with_slopes(got, expected, arguments, derivative=jax.jacfwd, atol=EXACT):
@@ -196,14 +207,11 @@ def test_mistakes_are_named(along, message):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_limits_may_lie_beyond_half_a_turn(dim):
     """Where the angle of an orientation jumps nothing happens, and what has one limit turns a long way from it."""
-
-    def end(upper, speed, only):
-        limits = {"upper": upper} if only else {"lower": -0.5, "upper": upper}
-        return turned(wheel(speed, dim, restitution=0.6, **limits), 1.0)[0]
-
-    bounced = end(4.0, 4.5, False)
+    both, one = {"lower": -0.5, "upper": 4.0, "restitution": 0.6}, {"upper": 0.5, "restitution": 0.6}
+    scene = wheels({"bounces": (4.5, both), "turns": (-4.5, one)}, dim)
+    bounced, gone = (turned(scene, 1.0, body)[0] for body in (0, 1))
     assert_allclose(bounced if dim == 2 else 2 * np.pi - bounced, 4.0 - 0.6 * 0.5, atol=EXACT)
-    assert_allclose(jnp.abs(end(0.5, -4.5, True)), 4.5 if dim == 2 else 2 * np.pi - 4.5, atol=EXACT)
+    assert_allclose(jnp.abs(gone), 4.5 if dim == 2 else 2 * np.pi - 4.5, atol=EXACT)
 
 
 def test_friction_of_a_slider_keeps_the_spin_of_its_rod():
