@@ -213,12 +213,12 @@ def _as_top(inverse: Array, q: Array, L: Array, span: Array) -> tuple[Array, Arr
     e, l = _odd_axis(lax.stop_gradient(inverse)), unrotate(q, L)
     about = dot(e, matrix_product(inverse, e))
     c = 0.5 * (inverse[0, 0] + inverse[1, 1] + inverse[2, 2] - about)
-    rest = inverse - c * _eye(c)
+    rest = inverse - c[None, None] * _eye(c)
     resolved = _most_turn(*map(lax.stop_gradient, (rest, about - c, l))) * span**2 < RESOLVED**2
-    turn = turn_series(rest, q, jnp.where(resolved, L, 0.0), None)
+    turn = turn_series(rest, q, jnp.where(resolved[None], L, 0.0), None)
     across = lax.stop_gradient(normalise(l - dot(e, l)[None] * e))
     c = c + jnp.where(resolved, 0.0, dot(across, matrix_product(rest, across)))
-    top = jnp.where(resolved, 0.0, ((about - c) * dot(e, l))[None] * e)
+    top = jnp.where(resolved, 0.0, (about - c) * dot(e, l))[None] * e
     return c[None] * L, jnp.concatenate([turn[:1] + top[None], turn[1:]])
 
 
@@ -249,10 +249,9 @@ def _odd_axis(inverse: Array) -> Array:
         S = jax.vmap(matrix_product, (None, 0))(S, S)  # of a symmetric matrix: its rows are its columns
         return safe_divide(S, (S[0, 0] + S[1, 1] + S[2, 2])[None, None])
 
-    first, second, third = lax.fori_loop(0, 6, squared, 3.0 * inverse / trace - _eye(trace))
-    axis = jnp.where(
-        first[0] >= jnp.maximum(second[1], third[2]), first, jnp.where(second[1] >= third[2], second, third)
-    )
+    first, second, third = lax.fori_loop(0, 6, squared, 3.0 * inverse / trace[None, None] - _eye(trace))
+    second_is_more, first_is_most = second[1] >= third[2], first[0] >= jnp.maximum(second[1], third[2])
+    axis = jnp.where(first_is_most[None], first, jnp.where(second_is_more[None], second, third))
     return normalise(axis, jnp.broadcast_to(_eye(trace)[2], axis.shape))
 
 
