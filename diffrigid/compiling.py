@@ -1,12 +1,21 @@
-"""Tracing and compiling sooner."""
+"""Tracing and compiling sooner, or compiling for speed."""
 
 import functools
 import gc
+import os
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
+import jax
+import jax.numpy as jnp
+from jax import lax
+
 QUICK = {"xla_cpu_use_fusion_emitters": False}  # half the time to compile; a quarter slower to run where large
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}  # a fifth less; slower by another quarter
+SPEED = (  # a loop whose step accesses fewer bytes is one function; vectors as wide as there are
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000",
+    "--xla_cpu_prefer_vector_width=512",
+)
 
 Inputs = ParamSpec("Inputs")
 Result = TypeVar("Result")
@@ -29,3 +38,35 @@ def uncollected(fn: Callable[Inputs, Result]) -> Callable[Inputs, Result]:
             gc.enable()
 
     return called
+
+
+def compile_for_speed() -> None:
+    """Have JAX compile for speed on a CPU, from here on in this process; call it before anything else uses JAX.
+
+    A loop, and so a rollout, is then one function, where XLA makes one of every few operations: three to ten times as
+    fast for a single world, 1.2 to 2.2 times for a batch. Compiling takes no longer in 2D. In 3D it takes up to twice
+    as long, and four times for the gradient of a cube. A fit, most of whose time is that of compiling, is better off
+    without. Sets XLA_FLAGS, which JAX reads when it is first used.
+
+    Raises:
+        RuntimeError: JAX was in use already, so that it did not read XLA_FLAGS.
+
+    Example:
+        >>> import diffrigid as dr  # doctest: +SKIP
+        >>> dr.compile_for_speed()  # doctest: +SKIP
+    """
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    os.environ["XLA_FLAGS"] = " ".join(flags + [flag for flag in SPEED if flag not in flags])
+    with jax.default_device(jax.devices("cpu")[0]):
+        program = _small_loop().compile().as_text()
+    if "xla_cpu_small_call" in (program or ""):
+        return
+    raise RuntimeError(
+        "compile_for_speed: JAX was in use before, and had read XLA_FLAGS: restart Python (the kernel of a notebook) "
+        "and call it right after the imports"
+    )
+
+
+def _small_loop() -> jax.stages.Lowered:
+    """A loop that XLA makes one function only if told so: each step of it accesses more than a kilobyte."""
+    return jax.jit(lambda x: lax.fori_loop(0, 2, lambda _, x: jnp.sin(x), x)).lower(jnp.zeros(1024))

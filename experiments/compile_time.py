@@ -1,13 +1,16 @@
 """How many CPU-seconds does a first rollout, a first Jacobian column and a first gradient take to compile?
 
-    python experiments/compile_time.py
+    python experiments/compile_time.py [--speed] [--core N]
 
 Tracing, lowering and compiling, without the persistent cache, of 120 steps of: one disc over a floor, three discs that
-collide, a cube over a floor, and a double pendulum. Each line is a process of its own.
+collide, a cube over a floor, and a double pendulum; and microseconds a step of one world, the median of repeated
+calls on one core. `--speed`: after `dr.compile_for_speed`. Each line is a process of its own.
 """
 
+import argparse
 import json
 import os
+import statistics
 import subprocess
 import sys
 import time
@@ -37,11 +40,14 @@ def scenes():
     }
 
 
-def measure(name):
+def measure(name, speed):
+    """Of each job the CPU-seconds before it runs, and the microseconds a step then takes."""
     import jax
 
     import diffrigid as dr
 
+    if speed:
+        dr.compile_for_speed()
     world, state = scenes()[name]()
 
     def path(world, state):
@@ -52,24 +58,44 @@ def measure(name):
         "column": lambda *pair: jax.jvp(path, pair, pair)[1],
         "gradient": jax.grad(lambda *pair: (path(*pair) ** 2).sum()),
     }
-    seconds = {}
+    costs = {}
     for job, function in jobs.items():
         jax.clear_caches()
         start = time.process_time()
-        jax.jit(function).lower(world, state).compile()
-        seconds[job] = time.process_time() - start
-    return seconds
+        compiled = jax.jit(function).lower(world, state).compile()
+        costs[job] = time.process_time() - start, 1e6 * seconds_of(lambda c=compiled: c(world, state)) / STEPS
+    return costs
+
+
+def seconds_of(call, runs=30):
+    import jax
+
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(runs):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
 
 
 def main():
-    if len(sys.argv) > 1:
-        return print(json.dumps(measure(sys.argv[1])))
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--speed", action="store_true", help="after `dr.compile_for_speed`")
+    parser.add_argument("--core", type=int, help="core to pin to; the last one unless told")
+    parser.add_argument("--scene", help=argparse.SUPPRESS)  # one line, in this process
+    args = parser.parse_args()
+    if args.scene:
+        return print(json.dumps(measure(args.scene, args.speed)))
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0)) if args.core is None else args.core})
     env = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0"}
-    print(f"{'CPU-seconds':16} rollout  column  gradient")
+    print(f"{'CPU-seconds, us per step':24} {'rollout':>13} {'column':>13} {'gradient':>13}")
     for name in scenes():
-        done = subprocess.run([sys.executable, __file__, name], env=env, capture_output=True, text=True, check=True)
-        seconds = json.loads(done.stdout.splitlines()[-1])
-        print(f"{name:16} {seconds['rollout']:7.1f} {seconds['column']:7.1f} {seconds['gradient']:9.1f}", flush=True)
+        command = [sys.executable, __file__, "--scene", name] + args.speed * ["--speed"]
+        done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+        costs = json.loads(done.stdout.splitlines()[-1]).values()
+        print(f"{name:24} " + " ".join(f"{compiling:6.1f} {step:6.1f}" for compiling, step in costs), flush=True)
 
 
 if __name__ == "__main__":

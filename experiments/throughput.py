@@ -1,17 +1,18 @@
 """How many world-steps a second does one core reach beside pymunk and Box2D, and what does a gradient cost?
 
-    python experiments/throughput.py [--scenes S1,S2] [--forward] [--runs 5] [--out FILE] [--core N]
+    python experiments/throughput.py [--scenes S1,S2] [--forward] [--plain] [--runs 5] [--out FILE] [--core N]
 
 One core; each case in a process of its own, so that compile time and peak memory are its own. A world-step is
 one step of one world, whatever its sub-steps. The native engines (pyb2d3 is Box2D v3) step their worlds in
-turn, from Python; diffrigid steps a batch in one call. pymunk computes in float64, the others in float32. The
+turn, from Python; diffrigid steps a batch in one call,
+compiled for speed (`dr.compile_for_speed`) unless `--plain`. pymunk computes in float64, the others in float32. The
 gradient is `value_and_grad` of the sum of squared final positions with respect to all initial velocities; its
 memory is that of the temporaries of the compiled program. Peaks of the process, in the JSON, hold the compiler too.
 
 One sweep a step: a body that is struck twice in 4 ms is repaired in the next step, as the peers do.
 
-2026-11-22, one core of an AMD EPYC (Zen 5): pymunk 1.3e6 (S1), 6.2e5 (S2); Box2D 6.1e5, 2.5e5; diffrigid 1.6e8 to
-1.9e8 and 1.9e6, that is 118 to 140 and 3.1 times pymunk; gradient over forward 5 (S1) and 8 (S2).
+2026-11-24, one core of an AMD EPYC (Zen 5): pymunk 9.9e5 (S1), 4.7e5 (S2); Box2D 5.8e5, 2.1e5; diffrigid 1.6e8 to
+1.7e8 and 1.9e6, that is 165 to 171 and 4.0 times pymunk; gradient over forward 7 (S1) and 9 (S2).
 """
 
 import argparse
@@ -39,20 +40,22 @@ ROW = "{rate:8.3g} {over_peer:9.3g} | {compile_s:9.2f} {grad_compile_s:9.2f} | "
 ROW += "{grad_over_forward:8.2f} {grad_temp_mb:7.0f} | "
 
 
-def peer_rate(engine, scenes, runs):
-    build, run, read = PEERS[engine]
+def peer_rate(scenes, case):
+    build, run, read = PEERS[case["engine"]]
     ends, row = timed(
-        runs, lambda worlds: [run(w, scenes[0]) for w in worlds], prepare=lambda: [build(s) for s in scenes]
+        case["runs"], lambda worlds: [run(w, scenes[0]) for w in worlds], prepare=lambda: [build(s) for s in scenes]
     )
     return row | {"sanity": scenes[0].check(*read(ends[0]))}
 
 
-def diffrigid_rate(scenes, runs, forward):
+def diffrigid_rate(scenes, case):
     import jax
     import jax.numpy as jnp
 
     import diffrigid as dr
 
+    if not case["plain"]:
+        dr.compile_for_speed()
     world, state = build_diffrigid(scenes[0])
     x, v = (jnp.array([getattr(s, key) for s in scenes], jnp.float32) for key in "xv")
     states = replace(jax.tree.map(lambda leaf: jnp.repeat(leaf[None], len(scenes), axis=0), state), x=x)
@@ -60,13 +63,13 @@ def diffrigid_rate(scenes, runs, forward):
     def roll(v, world, states):
         return dr.rollout_batch(world, replace(states, v=v), dt=scenes[0].dt, steps=scenes[0].steps, final_only=True)
 
-    end, row = timed_jit(runs, roll, v, world, states)
+    end, row = timed_jit(case["runs"], roll, v, world, states)
     sanity = scenes[0].check(end.x[0].tolist(), end.v[0].tolist()) | {"dtype": str(end.x.dtype)}
-    if forward:
+    if case["forward"]:
         return row | {"sanity": sanity}
     jax.clear_caches()  # what was traced for the forward run must not shorten the gradient's compile time
     loss = jax.value_and_grad(lambda *args: jnp.sum(roll(*args).x ** 2))
-    (_, grad), grad_row = timed_jit(runs, loss, v, world, states)
+    (_, grad), grad_row = timed_jit(case["runs"], loss, v, world, states)
     sanity |= {"grad_finite": bool(jnp.isfinite(grad).all())}
     row |= {f"grad_{key}": value for key, value in grad_row.items()}
     return row | {"grad_over_forward": row["grad_seconds"] / row["seconds"], "sanity": sanity}
@@ -101,8 +104,7 @@ def run_case(case):
     importlib.import_module(case["engine"])
     case["import_s"] = time.perf_counter() - start
     scenes = [SCENES[case["scene"]](world) for world in range(case["worlds"])]
-    engine, runs = case["engine"], case["runs"]
-    case |= peer_rate(engine, scenes, runs) if engine in PEERS else diffrigid_rate(scenes, runs, case["forward"])
+    case |= (peer_rate if case["engine"] in PEERS else diffrigid_rate)(scenes, case)
     return case | {"rate": len(scenes) * scenes[0].steps / case["seconds"]}
 
 
@@ -119,11 +121,11 @@ def run_in_process(case):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def measure(name, runs, forward):
+def measure(name, **options):
     best, rows, scene = 0.0, [], SCENES[name](0)
     peer_worlds = min(PEER_WORLDS, -(-PEER_BODIES // len(scene.x)))
     for engine, worlds in [(peer, peer_worlds) for peer in scene.peers] + [("diffrigid", n) for n in scene.worlds]:
-        case = {"scene": name, "engine": engine, "worlds": worlds, "runs": runs, "forward": forward}
+        case = {"scene": name, "engine": engine, "worlds": worlds} | options
         row = run_in_process(case)
         if engine in PEERS:
             best = max(best, row.get("rate", 0.0))
@@ -150,6 +152,7 @@ def main():
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     parser.add_argument("--forward", action="store_true", help="no gradients")
+    parser.add_argument("--plain", action="store_true", help="without `dr.compile_for_speed`")
     parser.add_argument("--runs", type=int, default=5, help="the least in a median")
     parser.add_argument("--core", type=int, help="core to pin to; the last one unless told")
     parser.add_argument("--case", type=json.loads, help=argparse.SUPPRESS)  # one case, in this process
@@ -160,7 +163,8 @@ def main():
         args.core = max(os.sched_getaffinity(0)) if args.core is None else args.core
         os.sched_setaffinity(0, {args.core})
     print(HEADER)
-    rows = [row for name in args.scenes.split(",") for row in measure(name, args.runs, args.forward)]
+    options = {"runs": args.runs, "forward": args.forward, "plain": args.plain}
+    rows = [row for name in args.scenes.split(",") for row in measure(name, **options)]
     args.out.write_text(json.dumps(machine() | {"core": args.core, "cases": rows}, indent=1) + "\n")
 
 

@@ -64,10 +64,9 @@ def test_derivatives_of_a_crowd_and_of_a_batch(many):
     # Not of the contact model: differences of what is not above zero leave what is allowed.
     along = jax.tree.map(lambda leaf: 0.1 * jnp.cos(jnp.arange(1.0, 1.0 + leaf.size)).reshape(leaf.shape), args)
     along = (dr.replace(along[0], contact=jax.tree.map(jnp.zeros_like, worlds.contact)), along[1])
-    value = jax.jit(lambda *args: weighted(*args)[0])
-    slope = jax.jit(lambda *args: jax.jvp(value, *args)[1])(args, along)
-    h = 1e-7
-    there, back = (value(*jax.tree.map(lambda a, d, s=s: a + s * h * d, args, along)) for s in (1.0, -1.0))
+    with_slope = jax.jit(lambda args: jax.jvp(lambda *args: weighted(*args)[0], args, along))
+    slope, h = with_slope(args)[1], 1e-7
+    there, back = (with_slope(jax.tree.map(lambda a, d, s=s: a + s * h * d, args, along))[0] for s in (1.0, -1.0))
     products = jax.tree.leaves(jax.tree.map(lambda a, b: (a * b).sum(), grad, along))
     assert_allclose(sum(products), slope, rtol=ROUNDING)
     assert_allclose(slope, (there - back) / (2 * h), rtol=1e-4)  # impacts magnify what is of second order in h

@@ -1,0 +1,50 @@
+"""What `compile_for_speed` makes of a rollout, in a process of its own."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+from numpy.testing import assert_allclose
+
+import diffrigid as dr
+
+SCRIPT = """
+import json
+import jax
+import diffrigid as dr
+
+dr.compile_for_speed()
+dr.compile_for_speed()  # once more changes nothing
+jax.config.update("jax_enable_x64", True)
+from test_compiling import bounces
+
+print(json.dumps(bounces()))
+"""
+
+
+def bounces():
+    """How many loops XLA has left in the program of a rollout, and where a spinning disc ends that falls on a floor."""
+    disc = dr.Body(dr.Disc(radius=0.2), mass=1.0, x=(0.0, 1.0), v=(1.0, 0.0), w=3.0)
+    bodies = {"disc": disc, "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))}
+    world, state = dr.scene(bodies, gravity=(0.0, -9.81), restitution=0.8, friction=0.3)
+    program = jax.jit(lambda *start: dr.rollout(*start, dt=1 / 60, steps=60).state.x[-1]).lower(world, state).compile()
+    return {"loops": program.as_text().partition("ENTRY")[2].count(" while("), "x": program(world, state).tolist()}
+
+
+def test_a_rollout_is_one_function_and_the_same():
+    where = Path(__file__).parent
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, cwd=where)
+    assert not done.returncode, done.stderr
+    found, expected = json.loads(done.stdout), bounces()
+    assert (found["loops"], expected["loops"]) == (0, 1)
+    assert_allclose(found["x"], expected["x"], rtol=1e-9)
+
+
+def test_too_late_is_an_error(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    jax.devices()
+    with pytest.raises(RuntimeError, match="compile_for_speed: JAX was in use before"):
+        dr.compile_for_speed()
