@@ -4,10 +4,10 @@
 
 One core; each case in a process of its own, so that compile time and peak memory are its own. A world-step is
 one step of one world, whatever its sub-steps. The native engines (pyb2d3 is Box2D v3) step their worlds in
-turn, from Python; diffrigid steps a batch in one call,
-compiled for speed (`dr.compile_for_speed`) unless `--plain`. pymunk computes in float64, the others in float32. The
-gradient is `value_and_grad` of the sum of squared final positions with respect to all initial velocities; its
-memory is that of the temporaries of the compiled program. Peaks of the process, in the JSON, hold the compiler too.
+turn, from Python; diffrigid steps a batch in one call, compiled for speed (`dr.compile_for_speed`) unless `--plain`.
+pymunk computes in float64, the others in float32. The gradient is `value_and_grad` of the sum of squared final
+positions with respect to all initial velocities; its memory is that of the temporaries of the compiled program. Peaks
+of the process, in the JSON, hold the compiler too.
 
 One sweep a step: a body that is struck twice in 4 ms is repaired in the next step, as the peers do.
 
