@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.branches import any_world
+from diffrigid import so3
 from diffrigid.forces import is_constant, total_wrench
 from diffrigid.linkage import joint_wrench
 from diffrigid.numerics import safe_divide
@@ -163,10 +163,7 @@ def orientation(f: Flight, s: Array) -> Array:
     for k in range(f.turn.shape[0] - 2, -1, -1):
         phi = f.turn[k] + t * phi
     within = so.turn_in_body(f.q, t * phi)
-    if f.carry is None:
-        return within
-    carried = any_world(f.carry != 0)  # in a world of balls and cubes nothing is
-    return lax.cond(carried, so.turn_by, lambda _, q: q, t * f.carry, within)
+    return within if f.carry is None else so3.carried(t * f.carry, within)
 
 
 @jax.jit

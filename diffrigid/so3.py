@@ -255,6 +255,17 @@ def _odd_axis(inverse: Array) -> Array:
     return normalise(axis, jnp.broadcast_to(_eye(trace)[2], axis.shape))
 
 
+@jax.custom_jvp
+def carried(phi: Array, q: Array) -> Array:
+    """`turn_by`, but where all of phi is zero, as for balls and cubes in free flight, q is not computed again."""
+    return lax.cond(any_world(phi != 0), turn_by, lambda _, q: q, phi, q)
+
+
+@carried.defjvp
+def _carried_jvp(primals, tangents):
+    return jax.jvp(turn_by, primals, tangents)  # of a body at rest phi is zero, but not its derivative
+
+
 def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
     """Rotation vector, in body axes, after time s, as a power series sum_k turn[k] s^(k+1); (K, 3, *batch).
 

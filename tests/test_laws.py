@@ -322,6 +322,21 @@ def test_a_symmetric_top_is_exact_at_any_spin(jacobian):
             assert_allclose(slope, true_slopes[name], atol=1e-9)
 
 
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+def test_what_rests_would_turn_by_its_spin(jacobian):
+    """Slopes where nothing turns yet, of a cube, a top and a box."""
+    inertias = jnp.array([(0.4, 0.4, 0.4), (0.4, 0.4, 0.7), (0.4, 0.5, 0.7)])
+
+    def end(w):
+        bodies = [dr.Body(None, mass=1.0, inertia=inertia, x=jnp.zeros(3), w=w) for inertia in inertias]
+        state = dr.rollout(*dr.scene({f"body {i}": body for i, body in enumerate(bodies)}), dt=1 / 60, steps=6).state
+        return state.q[-1]
+
+    slopes = jax.jit(jacobian(end))(jnp.zeros(3))
+    half = jnp.concatenate([jnp.zeros((1, 3)), 0.5 * jnp.eye(3)])  # dq/dphi at no turn
+    assert_allclose(slopes, jnp.broadcast_to(0.1 * half, slopes.shape), atol=ROUNDING)
+
+
 def test_what_spins_fast_about_nearly_a_principal_axis_turns_by_its_spin():
     """By 10 rad in each of ten steps, about each axis of a box of three moments."""
 
