@@ -126,6 +126,10 @@ def _product_of_rows(m: Any, r: Any) -> list[Array]:
     return [a * x + b * y + c * z for a, b, c in m]
 
 
+def _trace(m: Array) -> Array:
+    return m[0, 0] + m[1, 1] + m[2, 2]
+
+
 def _matrix(q: Array) -> list[list[Array]]:
     """Entries of the rotation matrix of q."""
     s, x, y, z = q
@@ -137,7 +141,7 @@ def _matrix(q: Array) -> list[list[Array]]:
 
 def inverse_inertia(inertia: Array) -> Array:
     """Inverse of a symmetric (3, 3, *batch) matrix by cofactors, [1/(kg m^2)]."""
-    trace = lax.stop_gradient(inertia[0, 0] + inertia[1, 1] + inertia[2, 2])[None, None]
+    trace = lax.stop_gradient(_trace(inertia))[None, None]
     a, b, c = inertia / trace  # of any unit: the square of a determinant may underflow
     bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
     return jnp.stack([bc, ca, ab], axis=1) / dot(a, bc)[None, None] / trace
@@ -212,7 +216,7 @@ def _as_top(inverse: Array, q: Array, L: Array, span: Array) -> tuple[Array, Arr
     """`free_turn` of bodies of any inertia."""
     e, l = _odd_axis(lax.stop_gradient(inverse)), unrotate(q, L)
     about = dot(e, matrix_product(inverse, e))
-    c = 0.5 * (inverse[0, 0] + inverse[1, 1] + inverse[2, 2] - about)
+    c = 0.5 * (_trace(inverse) - about)
     rest = inverse - c[None, None] * _eye(c)
     resolved = _most_turn(*map(lax.stop_gradient, (rest, about - c, l))) * span**2 < RESOLVED**2
     turn = turn_series(rest, q, jnp.where(resolved[None], L, 0.0), None)
@@ -243,11 +247,11 @@ def _odd_axis(inverse: Array) -> Array:
     The part of I^-1 without trace has its largest eigenvalue there, as the sum of the other two. Its 64th power has
     nothing else left but where the moments are about evenly spaced.
     """
-    trace = inverse[0, 0] + inverse[1, 1] + inverse[2, 2]
+    trace = _trace(inverse)
 
     def squared(_, S):
         S = jax.vmap(matrix_product, (None, 0))(S, S)  # of a symmetric matrix: its rows are its columns
-        return safe_divide(S, (S[0, 0] + S[1, 1] + S[2, 2])[None, None])
+        return safe_divide(S, _trace(S)[None, None])
 
     first, second, third = lax.fori_loop(0, 6, squared, 3.0 * inverse / trace[None, None] - _eye(trace))
     second_is_more, first_is_most = second[1] >= third[2], first[0] >= jnp.maximum(second[1], third[2])

@@ -10,12 +10,14 @@ calls on one core. `--speed`: after `dr.compile_for_speed`. Each line is a proce
 import argparse
 import json
 import os
-import statistics
 import subprocess
 import sys
 import time
 
+from throughput import timed
+
 STEPS, DT = 120, 1 / 60
+RUNS = 30  # the least in a median
 
 
 def scenes():
@@ -63,20 +65,10 @@ def measure(name, speed):
         jax.clear_caches()
         start = time.process_time()
         compiled = jax.jit(function).lower(world, state).compile()
-        costs[job] = time.process_time() - start, 1e6 * seconds_of(lambda c=compiled: c(world, state)) / STEPS
+        seconds = time.process_time() - start
+        _, row = timed(RUNS, lambda _, c=compiled: jax.block_until_ready(c(world, state)))
+        costs[job] = seconds, 1e6 / STEPS * row["seconds"]
     return costs
-
-
-def seconds_of(call, runs=30):
-    import jax
-
-    jax.block_until_ready(call())
-    times = []
-    for _ in range(runs):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def main():
