@@ -123,7 +123,7 @@ def _chunk(world: World) -> int:
         return len(pairs.a) * pairs.count * (1 if rounds else CORNER)
 
     contacts = sum(map(lanes, world.pairs))
-    least = 0 if world.crowd else 4  # a crowd is wide enough by itself
+    least = 0 if world.crowd else 5  # a crowd is wide enough by itself
     return int(2 ** np.clip(np.round(np.log2(LANES / (contacts + 4 * len(world.names)))), least, 12))
 
 

@@ -59,6 +59,16 @@ def fold(op: Any, table: Array, axis: int) -> Array:
     return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
 
 
+def first_highest(values: list[Array]) -> list[Array]:
+    """Of each of some values (...), whether it is the first of the highest, (...) bool."""
+    highest, chosen = functools.reduce(jnp.maximum, values), []
+    left = highest == highest
+    for value in values:
+        chosen.append(left & (value == highest))
+        left = left & (value != highest)
+    return chosen
+
+
 def rows_or_zeros(values: Array, index: tuple) -> Array:
     """`rows`, where the index -1 stands for zeros."""
     table = np.array(index)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from diffrigid.branches import opaque_true, unfused
 from diffrigid.gathers import MANY, fold
 from diffrigid.numerics import safe_divide
 
@@ -36,6 +37,8 @@ def _eliminated(matrix: Array, right: Array) -> Array:
         return _written_out(system)
     if len(matrix) <= SMALL:
         return _gauss_jordan(system)
+    # By itself, for else all that the matrix is made of is computed in the order of the transposed one.
+    system = unfused(opaque_true(right), lambda system: system, system)
     # What elimination makes of the right side beside the matrix needs no permutation.
     upper, reduced = jnp.split(lax.linalg.lu(jnp.moveaxis(system, (0, 1), (-2, -1)))[0], [len(matrix)], axis=-1)
     x = lax.linalg.triangular_solve(upper, reduced, left_side=True)[..., 0]

@@ -12,9 +12,9 @@ and not rounding. `slack` (*batch) [m] is how near counts as at a face, an edge 
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
-from diffrigid.gathers import rows
+from diffrigid.gathers import first_highest, rows
 from diffrigid.numerics import dot, norm, normalise, unit_vector
 from diffrigid.shapes import Box, Capsule, Disc, Hull, Polygon, Sphere, radius, vertices
 from diffrigid.so3 import cross
@@ -46,8 +46,8 @@ def box_distance(shape: Box, p: Array, inward: Array, slack: Array) -> tuple[Arr
     """Distance from a box: the largest of |p_i| - half_i on a face, Euclidean beyond edges and corners."""
     side = jnp.where(jnp.where(jnp.abs(p) > slack[None], p, inward) >= 0, 1.0, -1.0).astype(p.dtype)
     excess = side * p - shape.half
-    best = jnp.argmax(_reachable(excess, side * inward, slack), axis=0)
-    face = jax.nn.one_hot(best, p.shape[0], axis=0, dtype=p.dtype)
+    reachable = lax.stop_gradient(_reachable(excess, side * inward, slack))
+    face = jnp.stack(first_highest(list(reachable))).astype(p.dtype)
     beyond = (excess > slack[None]).sum(0) > 1
     outside = jnp.where(beyond[None], jnp.maximum(excess, 0.0), face)
     distance = jnp.where(beyond, norm(outside), dot(face, excess))

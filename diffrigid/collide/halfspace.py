@@ -1,6 +1,5 @@
 """Any rounded convex shape and a half-space."""
 
-import functools
 import itertools
 
 import jax
@@ -8,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.collide.contacts import Contacts
+from diffrigid.gathers import first_highest
 from diffrigid.numerics import components, dot
 from diffrigid.shapes import radius, vertices
 from diffrigid.state import rotations
@@ -51,12 +51,7 @@ def _lowest_side(normal: Array, half: Array) -> Array:
 
     It is the side across the axis along which the corners differ most in height.
     """
-    dim, heights = len(half), [jnp.abs(n * h) for n, h in zip(normal, half, strict=True)]
-    most = functools.reduce(jnp.maximum, heights)
-    across, left = [], most == most
-    for height in heights:  # the first of the highest
-        across.append(left & (height == most))
-        left = left & (height != most)
+    dim, across = len(half), first_highest([jnp.abs(n * h) for n, h in zip(normal, half, strict=True)])
     lowest = [jnp.where(n < 0, h, -h) for n, h in zip(normal, half, strict=True)]
 
     def corner(signs: tuple[int, ...]) -> Array:

@@ -32,6 +32,7 @@ from diffrigid.branches import any_world
 from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
 from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
 from diffrigid.contact.multipliers import solve_roughly
+from diffrigid.gathers import fold
 from diffrigid.linear import solve_regular
 from diffrigid.numerics import FOUND, dot, norm, safe_divide
 from diffrigid.pytree import array, pytree, replace, static
@@ -186,9 +187,9 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: 
 def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     """A Newton step, from which P is brought back into the cones.
 
-    Where that gains little, P is made smoother by some rounds in which each contact takes a share of the
-    masses of its bodies (Tonge et al. 2012); where that does not help, it is the best P that is made smoother. Without
-    both, P may go round in circles.
+    Where that gains little, half of the step is tried too, and the better of both made smoother by some rounds in which
+    each contact takes a share of the masses of its bodies (Tonge et al. 2012); where that does not help, it is the best
+    P that is made smoother. Without all that, P may go round in circles.
     """
     cone, v_rel, arms, mobility = given
     slope = _slope(cone, now.z)
@@ -197,9 +198,11 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     P, since = allowed(cone, now.P + dP), now.since
     z, r = _missing(P, *given)
 
-    def smoothed(P, *_):
+    def smoothed(P, _, r):
+        half = allowed(cone, now.P + 0.5 * dP)
+        nearer = _speed(cone, _missing(half, *given)[1]) < _speed(cone, r)
         before = jnp.where(now.since == PATIENCE, now.best, now.P)
-        P = _smoothed(jnp.where(now.since >= PATIENCE, before, P), *given)
+        P = _smoothed(jnp.where(now.since >= PATIENCE, before, jnp.where(nearer[None, None], half, P)), *given)
         return P, *_missing(P, *given)
 
     poor = _lacks(cone, now) & (_speed(cone, r) > LITTLE * now.error)
@@ -244,7 +247,7 @@ def _smoothed(P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility
 
 def _speed(cone: Cone, P: Array) -> Array:
     """The largest change of velocity by impulses at their contacts, (*batch) [m/s]."""
-    return jnp.max(cone.scale[:, None] * jnp.abs(P), (0, 1))
+    return jnp.max(cone.scale * fold(jnp.maximum, jnp.abs(P), 1), 0)
 
 
 def _least(cone: Cone) -> Array:
