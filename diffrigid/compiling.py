@@ -8,6 +8,7 @@ from typing import ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}  # half the time to compile; a quarter slower to run where large
@@ -38,6 +39,14 @@ def uncollected(fn: Callable[Inputs, Result]) -> Callable[Inputs, Result]:
             gc.enable()
 
     return called
+
+
+def is_own_program() -> bool:
+    """Whether what JAX does now is not part of a program that it traces, of `jax.jit`, a loop or a branch.
+
+    Only then has `jax.jit` options of its own: in another program it has those of that one.
+    """
+    return not isinstance(lax.neg(np.float32(0)), jax.core.Tracer)  # what is traced takes in every operation
 
 
 def compile_for_speed() -> None:

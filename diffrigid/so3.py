@@ -2,24 +2,43 @@
 
 Orientation q = unit quaternion (w, x, y, z), (4, *batch), body to world; in code `s, u = q[:1], q[1:]`, so that
 `w` stays the angular velocity. Vectors, angular velocities and momenta (3, *batch); inertia (3, 3, *batch).
+What is decorated by `whole` is so computed where there are no batch axes.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid import so3_whole
 from diffrigid.branches import any_world
 from diffrigid.gathers import fold
-from diffrigid.numerics import components, cos_sin, dot, normalise, safe_divide, safe_sqrt
+from diffrigid.numerics import components, dot, half_turn, normalise, safe_divide, safe_sqrt
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
 RESOLVED = 2.0  # [rad] of a turn within a step that the series resolves; see free_turn
 
 
+def whole(of_arrays: Callable, *ranks: int) -> Callable:
+    """Decorator: `of_arrays` where all arguments have these ranks, that is no batch axes."""
+
+    def decorate(by_components: Callable) -> Callable:
+        @functools.wraps(by_components)
+        def either(*args: Array) -> Array:
+            alone = all(arg.ndim == rank for arg, rank in zip(args, ranks, strict=True))
+            return (of_arrays if alone else by_components)(*args)
+
+        return either
+
+    return decorate
+
+
 @jax.jit
+@whole(so3_whole.cross, 1, 1)
 def cross(w: Array, r: Array) -> Array:
     """w x r: velocity of a point at r on a body that spins with w."""
     (a, b, c), (x, y, z) = w, r
@@ -30,6 +49,7 @@ moment = cross  # r x F: torque of a force F at r
 
 
 @jax.jit
+@whole(so3_whole.rotate, 1, 1)
 def rotate(q: Array, r: Array) -> Array:
     """Body axes to world axes: r + 2 s (u x r) + 2 u x (u x r)."""
     s, x, y, z = q
@@ -44,27 +64,32 @@ def _rotated(s: Array, x: Array, y: Array, z: Array, r: Any) -> list[Array]:
 
 
 @jax.jit
+@whole(so3_whole.unrotate, 1, 1)
 def unrotate(q: Array, r: Array) -> Array:
     """World axes to body axes."""
     s, x, y, z = q
     return components(*_rotated(-s, x, y, z, r))
 
 
+@whole(so3_whole.compose, 1, 1)
 def compose(q: Array, p: Array) -> Array:
     """First p, then q; brought back to unit length, so that rounding does not accumulate."""
     return _unit_product(q, p)
 
 
+@whole(so3_whole.exp, 1)
 def exp(phi: Array) -> Array:
     """Quaternion of the rotation vector phi [rad], (3, *batch)."""
     return components(*_exp(phi))
 
 
+@whole(so3_whole.turn_by, 1, 1)
 def turn_by(phi: Array, q: Array) -> Array:
     """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
     return _unit_product(_exp(phi), q)
 
 
+@whole(so3_whole.turn_in_body, 1, 1)
 def turn_in_body(q: Array, phi: Array) -> Array:
     """q turned further by the rotation vector phi in body axes, (A, *batch) [rad]."""
     return _unit_product(q, _exp(phi))
@@ -73,12 +98,7 @@ def turn_in_body(q: Array, phi: Array) -> Array:
 def _exp(phi: Array) -> list[Array]:
     """Components of the quaternion. XLA would compute a vector again for each component that is picked from it."""
     x, y, z = phi
-    square = x * x + y * y + z * z
-    small = square < 1e-8  # there the series below is exact to rounding, and sqrt has no derivative at 0
-    half = 0.5 * safe_sqrt(jnp.where(small, 1.0, square))
-    cosine, sine = cos_sin(half)
-    s = jnp.where(small, 1.0 - square / 8.0, cosine)
-    scale = jnp.where(small, 0.5 - square / 48.0, 0.5 * sine / half)
+    s, scale = half_turn(x * x + y * y + z * z)
     return [s, scale * x, scale * y, scale * z]
 
 
@@ -112,6 +132,7 @@ def log(q: Array) -> Array:
 
 
 @jax.jit
+@whole(so3_whole.matrix_product, 2, 1)
 def matrix_product(m: Array, r: Array) -> Array:
     """(3, 3, *batch) times (3, *batch)."""
     return components(*_product_of_rows(_entries(m), r))
@@ -147,6 +168,7 @@ def inverse_inertia(inertia: Array) -> Array:
     return jnp.stack([bc, ca, ab], axis=1) / dot(a, bc)[None, None] / trace
 
 
+@whole(so3_whole.spin, 2, 1, 1)
 def spin(inertia: Array, q: Array, w: Array) -> Array:
     """Angular momentum L = R I R^T w, world axes [kg m^2/s]."""
     s, x, y, z = q
@@ -160,6 +182,7 @@ def unspin(inverse: Array, q: Array, L: Array) -> Array:
 
 
 @jax.jit
+@whole(so3_whole.world_inverse, 2, 1)
 def world_inverse(inverse: Array, q: Array) -> Array:
     """Inverse inertia in world axes, R I^-1 R^T, (3, 3, *batch); `apply` multiplies by it."""
     R = _matrix(q)
@@ -322,11 +345,13 @@ def turn_rate(phi: Array, w: Array) -> Array:
     return w + 0.5 * twist + cross(phi, twist) / 12.0
 
 
+@whole(so3_whole.rate, 1, 1)
 def rate(w: Array, q: Array) -> Array:
     """dq/dt of a body that turns with w in world axes, (4, *batch) [1/s]."""
     return 0.5 * components(*_product([jnp.zeros_like(w[0]), *w], q))
 
 
+@whole(so3_whole.difference, 1, 1)
 def difference(q: Array, p: Array) -> Array:
     """p as seen from q: the rotation after which q brings to p."""
     s, x, y, z = q

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid.compiling import is_own_program
 
 SCRIPT = """
 import json
@@ -48,3 +49,20 @@ def test_too_late_is_an_error(monkeypatch):
     jax.devices()
     with pytest.raises(RuntimeError, match="compile_for_speed: JAX was in use before"):
         dr.compile_for_speed()
+
+
+def test_what_is_a_program_of_its_own():
+    """It may have options to compile by, which JAX refuses within another program."""
+    seen = []
+
+    def look(x):
+        seen.append(is_own_program())
+        return x
+
+    one, grad = jax.numpy.ones(2), jax.grad(look)
+    look(1.0), grad(1.0), jax.vmap(grad)(one), jax.jvp(look, (1.0,), (1.0,)), jax.linearize(look, 1.0)
+    assert all(seen)
+    seen.clear()
+    jax.jit(look)(1.0), jax.jit(grad)(1.0), jax.grad(jax.jit(look))(1.0), jax.lax.map(look, one)
+    jax.grad(jax.checkpoint(look))(1.0), jax.eval_shape(look, 1.0)
+    assert not any(seen)
