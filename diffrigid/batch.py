@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from diffrigid.compiling import uncollected
+from diffrigid.compiling import is_for_speed, uncollected
 from diffrigid.controls import as_controls, controlled
 from diffrigid.convert import numbers
 from diffrigid.devices import cut, devices, join, over_devices, pieces_of
@@ -23,8 +23,11 @@ from diffrigid.state import State
 from diffrigid.step import MEMORY, aligned, at_least_one, final_state, floats, scan_steps, step_length
 from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
-LANES = 2**15
-CORNER = 32  # lanes of a contact of shapes with corners: it is searched for, and is rarely alone
+LANES = 2**15  # of a chunk: one for each contact, or more, and four for each body of its worlds
+# Lanes of a contact of shapes with corners: it is searched for, and is rarely alone; and the most worlds of a chunk.
+# Compiled for speed a small chunk costs no more calls, and what one world of it needs is computed for fewer.
+CORNER, CORNER_FOR_SPEED = 32, 128
+MOST, MOST_FOR_SPEED = 2**12, 2**8
 
 
 @uncollected
@@ -115,16 +118,18 @@ def _batch_sizes(tree) -> list[int]:
 
 def _chunk(world: World) -> int:
     """Power of two of worlds whose contacts and bodies fill LANES."""
+    corner, most = (CORNER_FOR_SPEED, MOST_FOR_SPEED) if is_for_speed() else (CORNER, MOST)
 
     def lanes(pairs):
         rounds = all(
             isinstance(world.shapes[kind], Disc | Sphere | HalfSpace) for kind in (pairs.shape_a, pairs.shape_b)
         )
-        return len(pairs.a) * pairs.count * (1 if rounds else CORNER)
+        return len(pairs.a) * pairs.count * (1 if rounds else corner)
 
     contacts = sum(map(lanes, world.pairs))
     least = 0 if world.crowd else 5  # a crowd is wide enough by itself
-    return int(2 ** np.clip(np.round(np.log2(LANES / (contacts + 4 * len(world.names)))), least, 12))
+    filling = 2 ** np.round(np.log2(LANES / (contacts + 4 * len(world.names))))
+    return int(np.clip(filling, 2**least, most))
 
 
 def _state_bytes(world: World, state: State) -> int:

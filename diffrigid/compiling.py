@@ -76,6 +76,11 @@ def compile_for_speed() -> None:
     )
 
 
+def is_for_speed() -> bool:
+    """Whether JAX was told to compile as `compile_for_speed` has it."""
+    return set(SPEED) <= set(os.environ.get("XLA_FLAGS", "").split())
+
+
 def _small_loop() -> jax.stages.Lowered:
     """A loop that XLA makes one function only if told so: each step of it accesses more than a kilobyte."""
     return jax.jit(lambda x: lax.fori_loop(0, 2, lambda _, x: jnp.sin(x), x)).lower(jnp.zeros(1024))
