@@ -10,7 +10,7 @@ from diffrigid import paths as paths
 from diffrigid import sysid as sysid
 from diffrigid import view as view
 from diffrigid.batch import rollout_batch
-from diffrigid.compiling import compile_for_speed
+from diffrigid.compiling import QUICK, compile_for_speed
 from diffrigid.contact import Contact
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
 from diffrigid.impacts import contacts
@@ -82,6 +82,7 @@ __all__ = [
     "Polygon",
     "Profile",
     "Prismatic",
+    "QUICK",
     "Record",
     "Revolute",
     "Separation",

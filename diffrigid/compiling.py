@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-QUICK = {"xla_cpu_use_fusion_emitters": False}  # half the time to compile; a quarter slower to run where large
+QUICK = {"xla_cpu_use_fusion_emitters": False}  # half the time to compile; a batch runs a quarter slower, one world not
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}  # a fifth less; slower by another quarter
 SPEED = (  # a loop whose step accesses fewer bytes is one function; vectors as wide as there are
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000",

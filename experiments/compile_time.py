@@ -1,10 +1,11 @@
 """How many CPU-seconds does a first rollout, a first Jacobian column and a first gradient take to compile?
 
-    python experiments/compile_time.py [--speed] [--core N]
+    python experiments/compile_time.py [--plain | --speed] [--core N]
 
 Tracing, lowering and compiling, without the persistent cache, of 120 steps of: one disc over a floor, three discs that
 collide, a cube over a floor, and a double pendulum; and microseconds a step of one world, the median of repeated
-calls on one core. `--speed`: after `dr.compile_for_speed`. Each line is a process of its own.
+calls on one core. With the options `dr.QUICK`; `--plain`: without; `--speed`: after `dr.compile_for_speed`, without.
+Each line is a process of its own.
 """
 
 import argparse
@@ -42,14 +43,15 @@ def scenes():
     }
 
 
-def measure(name, speed):
+def measure(name, how):
     """Of each job the CPU-seconds before it runs, and the microseconds a step then takes."""
     import jax
 
     import diffrigid as dr
 
-    if speed:
+    if how == "speed":
         dr.compile_for_speed()
+    options = dr.QUICK if how == "quick" else None
     world, state = scenes()[name]()
 
     def path(world, state):
@@ -64,7 +66,7 @@ def measure(name, speed):
     for job, function in jobs.items():
         jax.clear_caches()
         start = time.process_time()
-        compiled = jax.jit(function).lower(world, state).compile()
+        compiled = jax.jit(function, compiler_options=options).lower(world, state).compile()
         seconds = time.process_time() - start
         _, row = timed(RUNS, lambda _, c=compiled: jax.block_until_ready(c(world, state)))
         costs[job] = seconds, 1e6 / STEPS * row["seconds"]
@@ -73,18 +75,21 @@ def measure(name, speed):
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("--speed", action="store_true", help="after `dr.compile_for_speed`")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--plain", dest="how", action="store_const", const="plain", help="as JAX does by itself")
+    how.add_argument("--speed", dest="how", action="store_const", const="speed", help="after `dr.compile_for_speed`")
+    parser.set_defaults(how="quick")
     parser.add_argument("--core", type=int, help="core to pin to; the last one unless told")
     parser.add_argument("--scene", help=argparse.SUPPRESS)  # one line, in this process
     args = parser.parse_args()
     if args.scene:
-        return print(json.dumps(measure(args.scene, args.speed)))
+        return print(json.dumps(measure(args.scene, args.how)))
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0)) if args.core is None else args.core})
     env = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0"}
     print(f"{'CPU-seconds, us per step':24} {'rollout':>13} {'column':>13} {'gradient':>13}")
     for name in scenes():
-        command = [sys.executable, __file__, "--scene", name] + args.speed * ["--speed"]
+        command = [sys.executable, __file__, "--scene", name] + [f"--{args.how}"] * (args.how != "quick")
         done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
         costs = json.loads(done.stdout.splitlines()[-1]).values()
         print(f"{name:24} " + " ".join(f"{compiling:6.1f} {step:6.1f}" for compiling, step in costs), flush=True)

@@ -13,7 +13,8 @@ import diffrigid as dr
 
 PAGE = (Path(__file__).parent.parent / "notebooks" / "api.md").read_text()
 NAMES = re.findall(r"\.\. auto(?:function|class):: (\w+)", PAGE)
-ELSEWHERE = {"replace", "missed_pairs"}  # that of `dataclasses`; and what needs a crowd: `tests/test_crowd.py`
+# What `dataclasses` and JAX describe, and what needs a crowd, in `tests/test_crowd.py`.
+ELSEWHERE = {"replace", "QUICK", "missed_pairs"}
 MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"} | {
     "missed_pairs", "fit_in_pieces", "jumps"
 }  # fmt: skip
