@@ -260,8 +260,10 @@ _rollout_jit, _rollout_quick = (
 
 
 def _soon(inputs: tuple, plain: Callable, quick: Callable) -> Callable:
-    """The one that compiles in half the time, where it may: for one world, which then runs as fast; a batch does not, nor
-    a crowd. Not where it is differentiated: reverse mode makes what is linear in it a part of another program."""
+    """The one that compiles in half the time, where it may: for one world, which then runs as fast.
+
+    A batch, or a crowd, would not. Where it is differentiated, reverse mode makes a part of another program of it.
+    """
     world, state, *_ = inputs
     one = state.x.ndim == 2 and not world.crowd
     return quick if one and not traced(inputs) and is_own_program() else plain
