@@ -52,10 +52,10 @@ def is_own_program() -> bool:
 def compile_for_speed() -> None:
     """Have JAX compile for speed on a CPU, from here on in this process; call it before anything else uses JAX.
 
-    A loop, and so a rollout, is then one function, where XLA makes one of every few operations: three to ten times as
-    fast for a single world, 1.2 to 2.2 times for a batch. Compiling takes no longer in 2D. In 3D it takes up to twice
-    as long, and four times for the gradient of a cube. A fit, most of whose time is that of compiling, is better off
-    without. Sets XLA_FLAGS, which JAX reads when it is first used.
+    A loop, and so a rollout, is then one function, where XLA makes one of every few operations: three to seven times as
+    fast for a single world, 1.2 to 2.2 times for a batch. Compiling takes no longer in 2D. In 3D it takes half as long
+    again, three times for a Jacobian's column and five times for a gradient. A fit, most of whose time is that of
+    compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
 
     Raises:
         RuntimeError: JAX was in use already, so that it did not read XLA_FLAGS.

@@ -11,8 +11,8 @@ of the process, in the JSON, hold the compiler too.
 
 One sweep a step: a body that is struck twice in 4 ms is repaired in the next step, as the peers do.
 
-2026-11-24, one core of an AMD EPYC (Zen 5): pymunk 9.9e5 (S1), 4.7e5 (S2); Box2D 5.8e5, 2.1e5; diffrigid 1.6e8 to
-1.7e8 and 1.9e6, that is 165 to 171 and 4.0 times pymunk; gradient over forward 7 (S1) and 9 (S2).
+2026-11-24, one core of an AMD EPYC (Zen 5): pymunk 1.0e6 (S1), 4.9e5 (S2); Box2D 5.8e5, 2.1e5; diffrigid 1.9e8 and
+1.9e6, that is 190 and 3.9 times pymunk; gradient over forward 6 to 7 (S1) and 9 (S2).
 """
 
 import argparse
