@@ -66,3 +66,15 @@ def test_what_is_a_program_of_its_own():
     jax.jit(look)(1.0), jax.jit(grad)(1.0), jax.grad(jax.jit(look))(1.0), jax.lax.map(look, one)
     jax.grad(jax.checkpoint(look))(1.0), jax.eval_shape(look, 1.0)
     assert not any(seen)
+
+
+def test_quick_changes_the_time_to_compile_and_nothing_else():
+    world, state = dr.scene({"disc": dr.Body(dr.Disc(radius=0.2), mass=1.0, x=(0.0, 1.0), w=3.0)}, gravity=(0.0, -9.81))
+
+    def height(world, state):
+        return dr.rollout(world, state, dt=1 / 60, steps=6).state.x[-1, 0, 1]
+
+    slopes = jax.grad(height, argnums=(0, 1))
+    quick = jax.jit(slopes, compiler_options=dr.QUICK)(world, state)
+    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-15), quick, slopes(world, state))
+    assert_allclose(quick[0].forces[0].g[..., 1].sum(), 0.1**2 / 2, rtol=1e-12)
