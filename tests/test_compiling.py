@@ -16,9 +16,12 @@ SCRIPT = """
 import json
 import jax
 import diffrigid as dr
+from diffrigid.compiling import is_for_speed
 
+assert not is_for_speed()
 dr.compile_for_speed()
 dr.compile_for_speed()  # once more changes nothing
+assert is_for_speed()  # then batches run in smaller chunks
 jax.config.update("jax_enable_x64", True)
 from test_compiling import bounces
 
