@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-QUICK = {"xla_cpu_use_fusion_emitters": False}  # half the time to compile; a batch runs a quarter slower, one world not
+QUICK = {"xla_cpu_use_fusion_emitters": False}  # half to three quarters of the time to compile; a batch runs slower
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}  # a fifth less; slower by another quarter
 SPEED = (  # a loop whose step accesses fewer bytes is one function; vectors as wide as there are
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000",
@@ -52,9 +52,9 @@ def is_own_program() -> bool:
 def compile_for_speed() -> None:
     """Have JAX compile for speed on a CPU, from here on in this process; call it before anything else uses JAX.
 
-    A loop, and so a rollout, is then one function, where XLA makes one of every few operations: three to seven times as
-    fast for a single world, 1.2 to 2.2 times for a batch. Compiling takes no longer in 2D. In 3D it takes half as long
-    again, three times for a Jacobian's column and five times for a gradient. A fit, most of whose time is that of
+    A loop, and so a rollout, is then one function, where XLA makes one of every few operations: two to seven times as
+    fast for a single world, 1.2 to 2.2 times for a batch. Compiling takes hardly longer in 2D. In 3D it takes half as
+    long again, three times for a Jacobian's column and five times for a gradient. A fit, most of whose time is that of
     compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
 
     Raises:

@@ -2,11 +2,9 @@
 
 Orientation q = unit quaternion (w, x, y, z), (4, *batch), body to world; in code `s, u = q[:1], q[1:]`, so that
 `w` stays the angular velocity. Vectors, angular velocities and momenta (3, *batch); inertia (3, 3, *batch).
-What is decorated by `whole` is so computed where there are no batch axes.
+Where there are no batch axes, what is decorated by `whole` is computed by its twin in `so3_whole`.
 """
 
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,24 +15,11 @@ from diffrigid import so3_whole
 from diffrigid.branches import any_world
 from diffrigid.gathers import fold
 from diffrigid.numerics import components, dot, half_turn, normalise, safe_divide, safe_sqrt
+from diffrigid.so3_whole import whole
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
 RESOLVED = 2.0  # [rad] of a turn within a step that the series resolves; see free_turn
-
-
-def whole(of_arrays: Callable, *ranks: int) -> Callable:
-    """Decorator: `of_arrays` where all arguments have these ranks, that is no batch axes."""
-
-    def decorate(by_components: Callable) -> Callable:
-        @functools.wraps(by_components)
-        def either(*args: Array) -> Array:
-            alone = all(arg.ndim == rank for arg, rank in zip(args, ranks, strict=True))
-            return (of_arrays if alone else by_components)(*args)
-
-        return either
-
-    return decorate
 
 
 @jax.jit

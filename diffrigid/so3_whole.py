@@ -15,6 +15,20 @@ from jax import Array
 from diffrigid.numerics import dot, half_turn
 
 
+def whole(of_arrays: Callable, *ranks: int) -> Callable:
+    """Decorator: `of_arrays` where all arguments have these ranks, that is no batch axes."""
+
+    def decorate(by_components: Callable) -> Callable:
+        @functools.wraps(by_components)
+        def either(*args: Array) -> Array:
+            alone = all(arg.ndim == rank for arg, rank in zip(args, ranks, strict=True))
+            return (of_arrays if alone else by_components)(*args)
+
+        return either
+
+    return decorate
+
+
 @functools.cache
 def _constant(make: Callable[[], np.ndarray], dtype: Any) -> Any:
     """An array that is made once; see `gathers.rows`."""
@@ -50,6 +64,10 @@ def matrix_product(m: Array, r: Array) -> Array:
     return (m * r[None]).sum(1)
 
 
+def _matrices_product(a: Array, b: Array) -> Array:
+    return (a[:, :, None] * b[None]).sum(1)
+
+
 def skew(w: Array) -> Array:
     """The matrix of r -> w x r."""
     return (_constant(_levi_civita, w.dtype) * w[None, :, None]).sum(1)
@@ -81,9 +99,8 @@ def spin(inertia: Array, q: Array, w: Array) -> Array:
 def world_inverse(inverse: Array, q: Array) -> Array:
     """R I^-1 R^T, with R = 1 + 2 s U + 2 U U."""
     U = skew(q[1:])
-    R = jnp.eye(3, dtype=q.dtype) + 2.0 * (q[0] * U + (U[:, :, None] * U[None]).sum(1))
-    half = (R[:, :, None] * inverse[None]).sum(1)
-    return (half[:, None] * R[None]).sum(2)
+    R = jnp.eye(3, dtype=q.dtype) + 2.0 * (q[0] * U + _matrices_product(U, U))
+    return _matrices_product(_matrices_product(R, inverse), R.T)
 
 
 def exp(phi: Array) -> Array:

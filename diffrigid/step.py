@@ -260,7 +260,7 @@ _rollout_jit, _rollout_quick = (
 
 
 def _soon(inputs: tuple, plain: Callable, quick: Callable) -> Callable:
-    """The one that compiles in half the time, where it may: for one world, which then runs as fast.
+    """The one that compiles sooner, where it may: for one world, which then runs about as fast.
 
     A batch, or a crowd, would not. Where it is differentiated, reverse mode makes a part of another program of it.
     """
