@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array, lax
 
 FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
+PASSED = "passed"  # of what a pass hands on to the next; with both, no step is computed again
 
 
 @jax.jit

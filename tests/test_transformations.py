@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.pytree import pytree
-from diffrigid.step import _rollout_quick, _step_quick
+from diffrigid.step import WORLDS, _rollout_quick, _step_quick, floats
 
 ROUNDING = 1e-11  # absolute, of values about 1: the same operations in another order
 EXACT = 1e-9  # relative: rounding of a few hundred steps
@@ -46,6 +46,23 @@ def test_jit_is_no_jit():
     assert_same(jax.jit(dr.step)(world, state, 1 / 60), compiled, 0.0)
     with jax.disable_jit():
         assert_same(dr.step(world, state, 1 / 60), compiled, ROUNDING)
+
+
+def test_what_reverse_mode_saves():
+    """The passes of all steps, or only the states between them, as memory allows: the same slopes."""
+    world, state = floats(*made(disc_and_plane, RUB))
+    room = STEPS * world.contact.saved_numbers(world, state) * state.x.dtype.itemsize
+    saved, slopes = [], []
+    for memory in (WORLDS * room, WORLDS * room - 1):
+
+        def end(world, state, memory=memory):
+            return dr.rollout(world, state, dt=1 / 60, steps=STEPS, memory=memory).state.x[-1].sum()
+
+        pull = jax.jit(lambda *inputs, end=end: jax.vjp(end, *inputs)[1])(world, state)
+        saved.append(sum(leaf.nbytes for leaf in jax.tree.leaves(pull)))
+        slopes.append(jax.jit(lambda pull: pull(1.0))(pull))
+    assert saved[0] <= room and saved[1] < 0.2 * saved[0]
+    assert_same(*slopes, ROUNDING)
 
 
 @pytest.mark.parametrize("axis", [0, -1], ids=["vmap", "trailing axis"])

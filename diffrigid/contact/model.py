@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import any_world
 from diffrigid.contact.anchors import Anchors
@@ -44,7 +45,7 @@ from diffrigid.contact.strikes import (
 )
 from diffrigid.flight import Flight, state_at
 from diffrigid.gathers import flags
-from diffrigid.numerics import FOUND, dot, safe_divide, with_tangents
+from diffrigid.numerics import FOUND, PASSED, dot, safe_divide, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
 
@@ -121,19 +122,34 @@ class Contact:
             return lax.cond(isolated & (phase == IMPACT), isolated_pass, lambda: one_pass(now, phase))
 
         def maybe(now, phase):
+            now = checkpoint_name(now, PASSED)
             needed = jnp.where(phase == IMPACT, now.found, any_world(now.rests))
             if now.known is not None:
                 needed = jnp.where(phase == REVERSE, any_world(now.known.reverses()), needed)
             some_pass = isolated_or_any if tables else one_pass
             return lax.cond(needed, lambda now: some_pass(now, phase), lambda now: now, now), None
 
-        impacts = self.sweeps + HOLDS * waits(world)
-        loaded, rows = is_loaded(world), len(always) + is_rolling(world) * contact_count(world)
-        phases = jnp.array([IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH])
-        nothing = jnp.zeros((rows, *start.state.x.shape[1:]), start.t0.dtype)
-        known = with_tangents(Known(P=nothing, early=nothing, rubs=nothing[:, 0]), (world, dt)) if loaded else None
-        first = Progress(start, resting, known, near, jnp.full(dt.shape, any(always)))
-        return lax.scan(maybe, first, phases)[0].anchors
+        nothing = jnp.zeros((_rows(world), *start.state.x.shape[1:]), start.t0.dtype)
+        known = Known(P=nothing, early=nothing, rubs=nothing[:, 0]) if is_loaded(world) else None
+        first = Progress(start, resting, with_tangents(known, (world, dt)), near, jnp.full(dt.shape, any(always)))
+        return checkpoint_name(lax.scan(maybe, first, jnp.array(self._phases(world)))[0].anchors, PASSED)
+
+    def _phases(self, world: Any) -> list[int]:
+        impacts, loaded = self.sweeps + HOLDS * waits(world), is_loaded(world)
+        return [IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH]
+
+    def saved_numbers(self, world: Any, state: State) -> int:
+        """About how many numbers reverse mode has to save of a step (FOUND, PASSED) to compute none of it again."""
+        if not ends(world)["a"]:
+            return 0
+        of_bodies = sum(leaf.size for leaf in jax.tree.leaves(state)) + 2 * len(state.x)
+        of_rows = (4 * world.dim + 8) * _rows(world)  # impulses found and known, times, gaps
+        return len(self._phases(world)) * (of_bodies + of_rows)
+
+
+def _rows(world: Any) -> int:
+    """Contacts, rows of joints, and those of contacts against turning. Static."""
+    return len(driven(world)) + is_rolling(world) * contact_count(world)
 
 
 class Progress(NamedTuple):
