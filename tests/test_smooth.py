@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid.contact.impact import meet_on_line
 
 ROUNDING = 1e-12  # relative: a few hundred operations
 EXACT = 1e-9  # relative: rounding of a few hundred steps
@@ -126,3 +127,19 @@ def test_annealing_compiles_once():
     ends = [end(smoothed(world, width), state) for width in (0.2, 0.05, 0.01, 0.0)]
     assert len(traces) == 1
     assert np.abs(ends[0] - ends[-1]).max() > 1e-3
+
+
+@pytest.mark.parametrize("speed", [1e-3, 1e-8, 1e-10, 1e-12, 1e-20, 0.0])
+@pytest.mark.parametrize("width", [0.0, 0.01])
+def test_slopes_of_discs_that_hardly_move_are_finite_in_single_precision(speed, width):
+    """Where the square of the square of a speed is rounded to 0."""
+
+    def meeting(P, W, R, width):
+        s, level, _, closing = meet_on_line(P, W, R, width)
+        return jnp.stack([jnp.where(s < 1.0, s, 0.0), level, closing])  # what does not meet soon has no part in a step
+
+    numbers = (np.array([0.2, 0.0]), np.array([-speed, 0.0]), np.array(0.2), np.array(width))
+    numbers = tuple(jnp.asarray(value, jnp.float32) for value in numbers)
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        for slope in jax.jit(jacobian(meeting, (0, 1, 2, 3)))(*numbers):
+            assert np.isfinite(slope).all()
