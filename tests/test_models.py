@@ -171,6 +171,17 @@ def test_a_urdf_is_that_of_mujoco(write):
     assert_allclose(world_axis, data.xaxis[model.joint("shoulder").id], atol=SAME)
 
 
+def test_shapes_that_share_a_name_are_all_there(write):
+    """With each other, or with a link."""
+    shapes = "".join(
+        f'<collision name="{name}"><geometry><sphere radius="0.1"/></geometry></collision>'
+        for name in ("tip", "tip", "upper")
+    )
+    world, _ = dr.load_urdf(write(ROBOT.replace('<link name="base">', f'<link name="base">{shapes}')))
+    assert world.names == ("upper", "lower", "tool")
+    assert world.static_names == ("tip_", "tip__", "upper_", "base_collision3")
+
+
 def test_a_floating_root_falls(write):
     text = ROBOT.replace(
         '<link name="base">',
@@ -217,6 +228,14 @@ REFUSED = {
     "class": (mjcf(BALL.replace("<geom", '<geom class="red"')), "class 'red', which is not in <default>"),
     "orientations": (mjcf('<body name="a" quat="1 0 0 0" euler="0 0 0"><freejoint/><geom size="1"/></body>'), "quat and euler: expected one"),
     "axis": (mjcf('<body name="a"><joint axis="0 0 0"/><geom size="1"/></body>'), "axis is zero"),
+    "axis of a turn": (mjcf('<body name="a" axisangle="0 0 0 90"><freejoint/><geom size="1"/></body>'), "axisangle is zero"),
+    "one axis twice": (mjcf('<body name="a" xyaxes="1 0 0 2 0 0"><freejoint/><geom size="1"/></body>'), "xyaxes is '1 0 0 2 0 0': expected two directions"),
+    "one end twice": (mjcf('<body name="a"><freejoint/><geom type="capsule" fromto="1 1 1 1 1 1" size="1"/></body>'), "fromto is '1 1 1 1 1 1': expected two points"),
+    "huge": (mjcf(BALL.replace("0.1", "1e200")), "size is '1e200': expected finite numbers"),
+    "overflow": (mjcf(BALL.replace("0.1", "3e102")), "expected finite numbers"),
+    "angles": (mjcf(BALL, '<compiler angle="degrees"/>'), "angle is 'degrees': expected one of degree, radian"),
+    "order of turns": (mjcf(BALL, '<compiler eulerseq="abc"/>'), "eulerseq is 'abc': expected three letters of x, y, z"),
+    "include": ("<mujoco><include/></mujoco>", "an <include> has no file"),
     "frame": (mjcf("<frame/>" + BALL), "<frame> in 'world' cannot be loaded"),
     "global": (mjcf(BALL, '<compiler coordinate="global"/>'), "expected local"),
     "a file that is cut short": ('<mujoco><include file="part.xml"/></mujoco>', "part.xml is no XML file"),

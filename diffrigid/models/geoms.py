@@ -40,8 +40,10 @@ def geometry_of(reader: Reader, R: np.ndarray) -> Made:
     if reader.given("fromto") and kind != "sphere":
         ends = reader.numbers("fromto", 6)
         axis = ends[3:] - ends[:3]
-        frame = Frame(0.5 * (ends[:3] + ends[3:]), onto(axis))
         half, radius = float(0.5 * np.linalg.norm(axis)), float(reader.some("size")[0])
+        if half == 0:
+            raise ValueError(f"{reader.where}: fromto is {reader.text('fromto')!r}: expected two points.")
+        frame = Frame(0.5 * (ends[:3] + ends[3:]), onto(axis))
         size = np.array([radius, radius, half] if SIZES[kind] == 3 else [radius, half])
     else:
         size = reader.some("size")[: SIZES[kind]]

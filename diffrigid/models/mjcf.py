@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid.contact import Contact
+from diffrigid.convert import largest
 from diffrigid.models.frames import Frame, about, from_axes, from_euler, from_quaternion, onto
 from diffrigid.models.geoms import geometry_of, mass_of
 from diffrigid.models.links import Geometry, Joint, Link, Mass, assemble, free_name, total
@@ -50,6 +51,7 @@ class Model:
         return name
 
 
+@np.errstate(over="ignore", invalid="ignore")  # `scene` refuses what is no number then
 def load_mjcf(path: str | Path, *, restitution: Any = 0.0, contact: Contact | None = None) -> tuple[World, State]:
     """World and state at the start of a MuJoCo file.
 
@@ -78,13 +80,14 @@ def load_mjcf(path: str | Path, *, restitution: Any = 0.0, contact: Contact | No
     where, root = str(path), read_xml(path, "mujoco")
     _include(root, Path(path).parent, (Path(path).resolve(),))
     compiler = _merged(where, root, "compiler")
-    angle, mode = compiler.text("angle", "degree"), compiler.text("inertiafromgeom", "auto")
+    angle, mode = compiler.word("angle", "degree", "radian"), compiler.word("inertiafromgeom", "auto", "true", "false")
     if compiler.text("coordinate", "local") != "local":
         raise ValueError(f"{where}: <compiler coordinate='global'> cannot be loaded: expected local coordinates.")
-    model = Model(
-        where, angle == "degree", str(compiler.text("eulerseq", "xyz")), compiler.text("autolimits") != "false",
-        str(mode), _classes(where, root),
-    )  # fmt: skip
+    sequence = str(compiler.text("eulerseq", "xyz"))
+    if len(sequence) != 3 or not set(sequence.lower()) <= set("xyz"):
+        raise ValueError(f"{compiler.where}: eulerseq is {sequence!r}: expected three letters of x, y, z, X, Y, Z.")
+    limited = compiler.word("autolimits", "true", "false") == "true"
+    model = Model(where, angle == "degree", sequence, limited, mode, _classes(where, root))
     option = _merged(where, root, "option")
     gravity = option.numbers("gravity", 3, (0.0, 0.0, -9.81))
     model.left_out += compiler.left_out("meshdir", "texturedir", "assetdir", "discardvisual", "strippath", "usethread")
@@ -106,6 +109,8 @@ def _include(root: ElementTree.Element, folder: Path, parents: tuple[Path, ...])
     for parent in list(root.iter()):
         for place, element in reversed(list(enumerate(parent))):
             if element.tag == "include":
+                if not element.get("file"):
+                    raise ValueError(f"{parents[-1]}: an <include> has no file.")
                 path = (folder / element.get("file", "")).resolve()
                 if path in parents:
                     raise ValueError(f"{path} includes itself.")
@@ -185,20 +190,26 @@ def _rotation(model: Model, reader: Reader) -> np.ndarray:
             return from_quaternion(_direction(reader, "quat", 4))
         case ["axisangle"]:
             *axis, angle = reader.numbers("axisangle", 4)
-            return about(np.array(axis), scale * angle)
+            return about(_not_zero(reader, "axisangle", np.array(axis)), scale * angle)
         case ["euler"]:
             return from_euler(scale * reader.numbers("euler", 3), model.sequence)
         case ["xyaxes"]:
-            axes = reader.numbers("xyaxes", 6)
-            return from_axes(axes[:3], axes[3:])
+            x, y = _not_zero(reader, "xyaxes", reader.numbers("xyaxes", 6).reshape(2, 3).T).T
+            if not np.cross(x / np.linalg.norm(x), y / np.linalg.norm(y)).any():
+                raise ValueError(f"{reader.where}: xyaxes is {reader.text('xyaxes')!r}: expected two directions.")
+            return from_axes(x, y)
         case ["zaxis"]:
             return onto(_direction(reader, "zaxis", 3))
     return np.eye(3)
 
 
 def _direction(reader: Reader, name: str, count: int, default: Any = None) -> np.ndarray:
-    values = reader.numbers(name, count, default)
-    if not values.any():
+    return _not_zero(reader, name, reader.numbers(name, count, default))
+
+
+def _not_zero(reader: Reader, name: str, values: np.ndarray) -> np.ndarray:
+    """A direction, or several as columns."""
+    if (np.abs(values).max(0) < 1 / largest(float)).any():
         raise ValueError(f"{reader.where}: {name} is zero: expected a direction.")
     return values
 
@@ -275,7 +286,7 @@ def _driven(model: Model, reader: Reader, kind: str) -> Joint:
     """A hinge or a slider, with its limits counted from where it is at the start."""
     scale = np.pi / 180.0 if model.degrees and kind == "hinge" else 1.0
     lower = upper = None
-    limited = reader.text("limited", "auto")
+    limited = reader.word("limited", "auto", "true", "false")
     if limited == "true" or limited == "auto" and model.limited and reader.given("range"):
         lower, upper = (float(s) for s in scale * (reader.numbers("range", 2) - reader.number("ref", 0.0)))
     reader.text("range")

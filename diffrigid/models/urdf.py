@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid.contact import Contact
+from diffrigid.convert import known_number
 from diffrigid.models.frames import Frame, from_euler
 from diffrigid.models.geoms import ALONG_Z
 from diffrigid.models.links import Geometry, Joint, Link, Mass, assemble, free_name, turned
@@ -19,6 +20,7 @@ KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "fixe
 QUIET = ("material", "transmission", "gazebo")
 
 
+@np.errstate(over="ignore", invalid="ignore")  # `scene` refuses what is no number then
 def load_urdf(
     path: str | Path, *, gravity: Any = (0.0, 0.0, -9.81), friction: Any = 0.0, restitution: Any = 0.0,
     contact: Contact | None = None, floating: bool = False,
@@ -59,11 +61,14 @@ def load_urdf(
         joints[child] = joint
     links: list[Link] = []
     places: dict[str, tuple[Link, Frame]] = {}  # of each link: the one that it is part of, and where in it
-    names: set[str] = set()
+    called: dict[str, str] = {}  # in the scene
+    for name in elements:
+        called[name] = free_name(name, called.values(), "_")
+    taken, rub = set(called.values()), float(known_number("friction", friction))
     for name in _ordered(where, elements, joints):
         element, moved_by = elements[name], joints.get(name)
-        mass, geometry = _mass(where, name, element), _geometry(where, name, element, float(friction), left_out)
-        link, place = _link(where, name, moved_by, places, mass, geometry, left_out, floating, names)
+        mass, geometry = _mass(where, name, element), _geometry(where, name, element, rub, left_out, taken)
+        link, place = _link(where, name, moved_by, places, mass, geometry, left_out, floating, called[name])
         places[name] = link, place
         if place is _WHOLE:
             links.append(link)
@@ -75,20 +80,18 @@ def load_urdf(
 _WHOLE = Frame()
 
 
-def _link(where, name, element, places, mass, geometry, left_out, floating, names):
+def _link(where, name, element, places, mass, geometry, left_out, floating, called):
     """The link, or the one that it is fixed to, and where it is in that."""
-    unique = free_name(name, names, "_")
-    names.add(unique)
     if element is None:
         moves = floating and mass is not None
-        return Link(unique, Frame(), None, Joint("free" if moves else "weld"), mass, geometry, not moves), _WHOLE
+        return Link(called, Frame(), None, Joint("free" if moves else "weld"), mass, geometry, not moves), _WHOLE
     owner, inside = places[_end(where, element, "parent", places)]
     origin = inside @ _origin(where, f"joint of {name}", element)
     joint = _joint(where, element, left_out)
     if joint.kind == "weld" and mass is None and not (owner.still and geometry):
         return owner, origin
     still = joint.kind == "weld" and owner.still
-    return Link(unique, owner.frame @ origin, owner.name, joint, mass, geometry, still), _WHOLE
+    return Link(called, owner.frame @ origin, owner.name, joint, mass, geometry, still), _WHOLE
 
 
 def _ordered(where: str, elements: dict, joints: dict) -> list[str]:
@@ -145,8 +148,8 @@ def _mass(where: str, name: str, element: ElementTree.Element) -> Mass | None:
     return Mass(mass, frame.x, turned(inertia, frame.R))
 
 
-def _geometry(where: str, name: str, element: ElementTree.Element, friction: float, left_out: list[str]):
-    """The collision shapes of a link."""
+def _geometry(where: str, name: str, element: ElementTree.Element, friction: float, left_out: list, taken: set[str]):
+    """The collision shapes of a link, under names that are not taken."""
     out = []
     for index, collision in enumerate(element.findall("collision")):
         frame, holder = _origin(where, f"collision of {name}", collision), collision.find("geometry")
@@ -166,8 +169,9 @@ def _geometry(where: str, name: str, element: ElementTree.Element, friction: flo
             case _:
                 left_out.append(f"contacts of {name}, a {solid.tag}")
                 continue
-        label = collision.get("name") or f"{name}_collision{index}"
-        out.append(Geometry(label.replace(".", "_"), shape, frame, friction))
+        label = free_name(collision.get("name") or f"{name}_collision{index}", taken, "_")
+        taken.add(label)
+        out.append(Geometry(label, shape, frame, friction))
     return tuple(out)
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from diffrigid.convert import largest
+
 
 def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
     """The root of a file; whatever it is called if `root` is None.
@@ -14,7 +16,7 @@ def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
         ValueError: it is no XML, or its root is called otherwise.
     """
     try:
-        found = ElementTree.parse(path).getroot()
+        found = ElementTree.parse(Path(path)).getroot()  # a Path, for a number would be an open file
     except (ElementTree.ParseError, UnicodeDecodeError, LookupError) as error:
         raise ValueError(f"{path} is no XML file: {error}") from None
     if root is not None and found.tag != root:
@@ -33,6 +35,13 @@ class Reader:
     def text(self, name: str, default: str | None = None) -> str | None:
         self.asked.add(name)
         return self.attributes.get(name, default)
+
+    def word(self, name: str, default: str, *others: str) -> str:
+        """One of some words."""
+        text = self.text(name, default)
+        if text not in (default, *others):
+            raise ValueError(f"{self.where}: {name} is {text!r}: expected one of {', '.join((default, *others))}.")
+        return str(text)
 
     def given(self, name: str) -> bool:
         return name in self.attributes
@@ -56,7 +65,7 @@ class Reader:
             values = np.array([float(part) for part in text.split()])
         except ValueError:
             values = np.zeros(0)
-        if not len(values) or not np.isfinite(values).all():
+        if not len(values) or not (np.abs(values) < largest(float)).all():
             raise ValueError(f"{self.where}: {name} is {text!r}: expected finite numbers.")
         return values
 
