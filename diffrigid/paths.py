@@ -116,7 +116,7 @@ def places(world: World, path: str) -> list[Place]:
 
 def component(path: str) -> tuple[str, int | None]:
     """Path of the whole and index: "ball.v[0]" is ("ball.v", 0), "ball.v" is ("ball.v", None)."""
-    match = re.fullmatch(r"(.+)\[(\d+)\]", path)
+    match = re.fullmatch(r"(.+)\[(\d+)\]", path, re.DOTALL)
     return (match[1], int(match[2])) if match else (path, None)
 
 

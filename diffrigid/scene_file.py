@@ -77,9 +77,9 @@ def read_scene(path: str | Path) -> SceneFile:
         ValueError: names the file, the table and the key, what was expected, and the nearest name.
     """
     try:
-        with open(path, "rb") as file:
+        with open(Path(path), "rb") as file:  # a Path, for a number would be an open file
             data = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML file: {error}") from None
     for key in data:
         if key not in (*TABLES, *ARGUMENTS):

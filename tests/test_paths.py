@@ -104,6 +104,11 @@ def test_angle_is_another_name_for_q():
     assert_allclose(paths.read(*FLAT, "ball.angle"), 0.4, rtol=1e-15)
 
 
+def test_a_name_may_have_lines():
+    scene = dr.scene({"a\nb": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0))})
+    assert paths.read(*scene, "a\nb.x[1]") == 1.0
+
+
 def test_values_may_carry_the_batch_of_their_leaf():
     world = dr.replace(FLAT[0], bodies=dr.replace(FLAT[0].bodies, mass=jnp.ones((3, 4))))
     one, each = (paths.write(world, FLAT[1], "ball.mass", value)[0] for value in (2.0, jnp.arange(4.0)))

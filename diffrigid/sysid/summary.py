@@ -83,7 +83,7 @@ def load_fit(path: str | Path) -> Summary:
             parameters=parameters, costs=np.asarray(data.pop("costs"), float), notes=tuple(data.pop("notes")),
             orders=orders, **data,
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not a saved fit: {error}") from error
 
 
