@@ -170,7 +170,7 @@ def columns(
 def read_csv(path: str | Path) -> dict[str, np.ndarray]:
     """Columns of a file with one line of names; an empty cell is missing."""
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
+        with open(Path(path), newline="", encoding="utf-8-sig") as file:  # a number would be an open file
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is no CSV file: {error}") from None
