@@ -1,4 +1,4 @@
-"""Scenes that `throughput.py` runs, and how each engine builds, steps and reads them.
+"""Scenes that `throughput.py` runs, and how diffrigid builds them; `bench_peers.py` has the other engines.
 
 SI units. `check(x, v)` of the final positions and velocities -> dict with "ok": did the engine do the same physics? To
 add a scene: a function of the world's number (each starts a little differently) and a line in SCENES. `worlds` are the
@@ -11,9 +11,8 @@ from collections import defaultdict, namedtuple
 
 # Bodies of one shape, (radius,) of discs or the half sizes of boxes, N pairs or triples x, v and w, between walls
 # (normal, offset) that keep normal . x >= offset. chain: each is joined to the one before, the first to the origin.
-FIELDS = "peers worlds dt steps size mass friction restitution gravity walls x v w chain check"
+FIELDS = "worlds dt steps size mass friction restitution gravity walls x v w chain check"
 Scene = namedtuple("Scene", FIELDS, defaults=[None] * len(FIELDS.split()))
-FLAT = ("pymunk", "pyb2d3")
 FLOOR = (((0.0, 1.0), 0.0),)
 
 
@@ -22,7 +21,6 @@ def bounce(world):
         return {"height": round(x[0][1], 4), "exact": 1.217, "ok": abs(x[0][1] - 1.217) < 0.02}
 
     return Scene(
-        peers=FLAT,
         worlds=(1024, 4096),
         dt=1 / 240,
         steps=240,
@@ -48,7 +46,6 @@ def billiards(world):
 
     angles = [2.399963 * i + 0.1 * world for i in range(16)]
     return Scene(
-        peers=FLAT,
         worlds=(1024, 4096),
         dt=1 / 240,
         steps=600,
@@ -71,7 +68,6 @@ def boxes(world):
         return {"top": round(max(heights), 3), "lowest": round(min(heights), 4), "speed": round(speed, 4), "ok": ok}
 
     return Scene(
-        peers=FLAT,
         worlds=(64,),
         dt=1 / 240,
         steps=600,
@@ -93,7 +89,6 @@ def cube_toss(world):
         return {"height": round(x[0][2], 4), "speed": round(speed, 4), "ok": abs(x[0][2] - 0.05) < 1e-3}
 
     return Scene(
-        peers=("mujoco",),
         worlds=(512,),
         dt=1 / 148,
         steps=200,
@@ -113,12 +108,12 @@ def cube_toss(world):
 def pendulum(world):
     del world  # all alike
 
-    def check(x, v):  # energy from rest at height 0, without that of rotation
+    def check(x, v):  # without the energy of rotation; they fall by 61 J. Exact: MuJoCo's RK4, a sixteenth of the step
         energy = sum(9.81 * body[1] for body in x) + 0.5 * sum(s**2 for body in v for s in body)
-        return {"last": [round(s, 3) for s in x[-1]], "energy": round(energy, 3), "ok": -12 < energy < 0.0}
+        ok = math.dist(x[-1], (1.233, -1.074)) < 0.6 and abs(energy + 0.681) < 15
+        return {"last": [round(s, 3) for s in x[-1]], "energy": round(energy, 3), "ok": ok}
 
     return Scene(
-        peers=FLAT,
         worlds=(256,),
         dt=1 / 240,
         steps=600,
@@ -160,7 +155,6 @@ def gas(count):
 
         angles = [2.399963 * i + 0.1 * world for i in range(count)]
         return Scene(
-            peers=FLAT,
             worlds=(1,),
             dt=1 / 240,
             steps=240,
@@ -182,98 +176,6 @@ SCENES = {"S1": bounce, "S2": billiards, "S3": boxes, "S4": cube_toss, "S5": pen
 SCENES |= {f"S6_{count}": gas(count) for count in (64, 256, 1024, 4096)}
 
 
-def half_length(scene):
-    """Of the bars that stand for walls [m]."""
-    return max([10.0, *(abs(1.1 * offset) for _, offset in scene.walls)])
-
-
-def build_pymunk(scene):
-    import pymunk
-
-    space = pymunk.Space()
-    space.gravity = (0.0, -scene.gravity)
-    space.collision_slop = 0.005  # [m] as Box2D's; the default of 0.1 is meant for pixels
-    shapes = []
-    half = half_length(scene)
-    for (nx, ny), offset in scene.walls:  # a bar 20 m long, or longer, and 1 m thick
-        cx, cy = nx * (offset - 0.5), ny * (offset - 0.5)
-        ends = (cx - half * ny, cy + half * nx), (cx + half * ny, cy - half * nx)
-        shapes.append(pymunk.Segment(space.static_body, *ends, 0.5))
-    sides = tuple(2 * half for half in scene.size)
-    disc = len(sides) == 1
-    moment = (
-        pymunk.moment_for_circle(scene.mass, 0.0, *scene.size) if disc else pymunk.moment_for_box(scene.mass, sides)
-    )
-    bodies = [pymunk.Body(scene.mass, moment) for _ in scene.x]
-    shapes += [pymunk.Circle(b, *scene.size) if disc else pymunk.Poly.create_box(b, sides) for b in bodies]
-    for body, x, v in zip(bodies, scene.x, scene.v, strict=True):
-        body.position, body.velocity = x, v
-    for shape in shapes:  # pymunk multiplies the numbers of the two shapes
-        shape.elasticity, shape.friction = math.sqrt(scene.restitution), math.sqrt(scene.friction)
-        shape.filter = pymunk.ShapeFilter(group=int(bool(scene.chain)))
-    space.add(*bodies, *shapes)
-    for before, body in zip([None, *bodies], bodies, strict=False) if scene.chain else ():
-        hook = (space.static_body, body, (0, 0)) if before is None else (before, body, (scene.size[0], 0))
-        space.add(pymunk.PivotJoint(*hook, (-scene.size[0], 0)))
-    return space, bodies
-
-
-def build_box2d(scene):
-    import pyb2d3
-
-    world = pyb2d3.World(gravity=(0.0, -scene.gravity), restitution_threshold=0.0)
-    world.sleeping_enabled = False
-    material = pyb2d3.surface_material(friction=scene.friction, restitution=scene.restitution)
-    ground = world.create_static_body(position=(0.0, 0.0))
-    for (nx, ny), offset in scene.walls:  # a bar 20 m long, or longer, and 1 m thick
-        center = nx * (offset - 0.5), ny * (offset - 0.5)
-        bar = pyb2d3.box(hx=0.5, hy=half_length(scene), center=center, rotation=math.atan2(ny, nx))
-        ground.create_shape(pyb2d3.shape_def(material=material), bar)
-    disc = len(scene.size) == 1
-    area = math.pi * scene.size[0] ** 2 if disc else 4 * math.prod(scene.size)
-    apart = {"filter": pyb2d3.make_filter(group_index=-1)} if scene.chain else {}
-    stuff = pyb2d3.shape_def(density=scene.mass / area, material=material, **apart)
-    pairs = zip(scene.x, scene.v, strict=True)
-    bodies = [world.create_dynamic_body(position=x, linear_velocity=v) for x, v in pairs]
-    half = scene.size[0]
-    for body in bodies:
-        body.create_shape(stuff, pyb2d3.circle(radius=half) if disc else pyb2d3.box(hx=half, hy=scene.size[-1]))
-    for before, body in zip([None, *bodies], bodies, strict=False) if scene.chain else ():
-        hook = {"body_a": ground, "local_anchor_a": (0.0, 0.0)}
-        hook = hook if before is None else {"body_a": before, "local_anchor_a": (half, 0.0)}
-        world.create_revolute_joint(body_b=body, local_anchor_b=(-half, 0.0), **hook)
-    return world, bodies
-
-
-def build_mujoco(scene):
-    """One cube. MuJoCo has no restitution: its contacts get the damping ratio that rebounds alike."""
-    import mujoco
-    import numpy as np
-    from mujoco import rollout
-
-    z = -math.log(scene.restitution) / math.hypot(math.pi, math.log(scene.restitution))
-    contact = f'condim="3" friction="{scene.friction} 0.0001 0.0001" solref="{0.0112 / z:.5g} {z:.5g}"'
-    size = " ".join(map(str, scene.size))
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><option timestep="{scene.dt}" gravity="0 0 {-scene.gravity}"/><worldbody>'
-        f'<geom type="plane" size="50 50 1" {contact}/>'
-        f'<body><freejoint/><geom type="box" size="{size}" mass="{scene.mass}" {contact}/></body></worldbody></mujoco>'
-    )
-    data = mujoco.MjData(model)
-    data.qpos[:3], data.qvel[:] = scene.x[0], (*scene.v[0], *scene.w[0])
-    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
-    state = np.zeros((1, mujoco.mj_stateSize(model, full)))
-    mujoco.mj_getState(model, data, state[0], full)
-    return rollout.Rollout(nthread=0), model, data, state
-
-
-def roll_mujoco(world, scene):
-    roller, model, data, state = world
-    states, sensors = roller.rollout(model, data, state, nstep=scene.steps)
-    del sensors
-    return states[0, -1]
-
-
 def build_diffrigid(scene):
     import diffrigid as dr
 
@@ -292,29 +194,3 @@ def build_diffrigid(scene):
         joints=joints if scene.chain else (),
         ignore=list(itertools.combinations(names, 2)) if scene.chain else (),
     )
-
-
-def _run(step_arguments):
-    def run(world, scene):
-        for _ in range(scene.steps):
-            world[0].step(scene.dt, *step_arguments)
-        return world
-
-    return run
-
-
-def _read(velocity):
-    # A body of Box2D does not outlive its world.
-    return lambda world: zip(*((tuple(b.position), tuple(getattr(b, velocity))) for b in world[1]), strict=True)
-
-
-def _read_mujoco(state):
-    return [state[1:4].tolist()], [state[8:11].tolist()]
-
-
-# engine: build, all steps of a world, positions and velocities from what that returns. Box2D takes 4 sub-steps.
-PEERS = {
-    "pymunk": (build_pymunk, _run(()), _read("velocity")),
-    "pyb2d3": (build_box2d, _run((4,)), _read("linear_velocity")),
-    "mujoco": (build_mujoco, roll_mujoco, _read_mujoco),
-}

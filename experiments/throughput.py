@@ -1,24 +1,27 @@
-"""How many world-steps a second does one core reach beside pymunk and Box2D, and what does a gradient cost?
+"""How many world-steps a second does one core reach beside nine other engines, and what does a gradient cost?
 
     python experiments/throughput.py [--scenes S1,S2] [--forward] [--plain] [--runs 5] [--out FILE] [--core N]
+        [--figure FILE] [--measured]
 
 One core; each case in a process of its own, so that compile time and peak memory are its own. A world-step is
-one step of one world, whatever its sub-steps. The native engines (pyb2d3 is Box2D v3) step their worlds in
-turn, from Python; diffrigid steps a batch in one call, compiled for speed (`dr.compile_for_speed`) unless `--plain`.
-pymunk computes in float64, the others in float32. The gradient is `value_and_grad` of the sum of squared final
-positions with respect to all initial velocities; its memory is that of the temporaries of the compiled program. Peaks
-of the process, in the JSON, hold the compiler too.
+one step of one world, whatever its sub-steps. The native engines step their worlds in turn, from Python or, MuJoCo,
+by its rollout; diffrigid, MJX, Brax and Jax2D step a batch in one call, compiled apart, all of them as
+`dr.compile_for_speed` has it unless `--plain`. Batches of the peers grow as long as that is a gain. pymunk, Bullet and
+MuJoCo compute in float64, the others in float32. The gradient is `value_and_grad` of the sum of squared final positions
+with respect to all initial velocities; its memory is that of the temporaries of the compiled program. Peaks of the
+process, in the JSON, hold the compiler too. Figures are medians.
 
-One sweep a step: a body that is struck twice in 4 ms is repaired in the next step, as the peers do.
+An engine counts as a peer of a scene where its bodies end as they should: `check` of the scene, "ok" in the line.
+pymunk, Box2D and MuJoCo are in the extra `experiments`; of these, what is not installed is left out:
 
-2026-11-24, one core of an AMD EPYC (Zen 5): pymunk 1.0e6 (S1), 4.9e5 (S2); Box2D 5.8e5, 2.1e5; diffrigid 1.9e8 and
-1.9e6, that is 190 and 3.9 times pymunk; gradient over forward 6 to 7 (S1) and 9 (S2).
+    pip install mujoco-mjx==3.17.0 brax==0.14.2 jax2d==1.0.2 chex==0.1.92 pybullet==3.2.7 rapier3d==0.36.1
+
+One sweep a step: a body that is struck twice in 4 ms is repaired in the next step, as the peers do. Of Brax, the
+generalized pipeline (2e3 steps a second of the cube) is left out.
 """
 
 import argparse
-import importlib.util
 import json
-import math
 import os
 import re
 import resource
@@ -26,26 +29,48 @@ import statistics
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from dataclasses import replace
 from importlib.metadata import distributions
 from pathlib import Path
 
-from bench_scenes import PEERS, SCENES, build_diffrigid
+from bench_peers import PEERS, kind, peers_of
+from bench_report import HEADER, draw, line, summary
+from bench_scenes import SCENES, build_diffrigid
 
 MIN_SECONDS = 1.0  # a median is over at least so much time, after a warm-up
+MAX_SECONDS = 900  # of a case
+MAX_RUN = 20.0  # [s] that a larger batch may take at the rate of the one before
 PEER_WORLDS, PEER_BODIES = 32, 1024  # worlds in a timed run, but no more than so many bodies; Box2D holds 128 worlds
-HEADER = "scene engine    worlds  steps/s over peer | compile s  gradient | grad/fwd temp MB | sanity"
-ROW = "{rate:8.3g} {over_peer:9.3g} | {compile_s:9.2f} {grad_compile_s:9.2f} | "
-ROW += "{grad_over_forward:8.2f} {grad_temp_mb:7.0f} | "
+BATCHES = (1, 64, 1024)  # of the batched peers, as long as the rate grows
+LONG = ("S3", "S4")  # their gradients take many minutes to compile
+PACKAGES = {peer.package for peer in PEERS.values()} | {"diffrigid", "jax", "jaxlib", "numpy"}
+VERSIONS = {d.name: d.version for d in distributions() if d.name in PACKAGES}
 
 
-def peer_rate(scenes, case):
-    build, run, read = PEERS[case["engine"]]
+def native_rate(scenes, case):
+    peer = PEERS[case["engine"]]
     ends, row = timed(
-        case["runs"], lambda worlds: [run(w, scenes[0]) for w in worlds], prepare=lambda: [build(s) for s in scenes]
+        case["runs"],
+        lambda worlds: [peer.run(w, scenes[0]) for w in worlds],
+        prepare=lambda: [peer.build(s) for s in scenes],
     )
-    return row | {"sanity": scenes[0].check(*read(ends[0]))}
+    return row | {"sanity": scenes[0].check(*peer.read(ends[0], scenes[0]))}
+
+
+def batched_rate(scenes, case):
+    import jax
+
+    import diffrigid as dr
+
+    if not case["plain"]:
+        dr.compile_for_speed()
+    start, step, read = PEERS[case["engine"]].build(scenes)
+
+    def roll(states):
+        return jax.lax.scan(lambda s, _: (jax.vmap(step)(s), None), states, None, length=scenes[0].steps)[0]
+
+    end, row = timed_jit(case["runs"], roll, start)
+    return row | {"sanity": scenes[0].check(*read(jax.tree.map(lambda leaf: leaf[0], end)))}
 
 
 def diffrigid_rate(scenes, case):
@@ -100,50 +125,56 @@ def timed(runs, run, prepare=lambda: None):
 
 
 def run_case(case):
-    start = time.perf_counter()
-    importlib.import_module(case["engine"])
-    case["import_s"] = time.perf_counter() - start
     scenes = [SCENES[case["scene"]](world) for world in range(case["worlds"])]
-    case |= (peer_rate if case["engine"] in PEERS else diffrigid_rate)(scenes, case)
+    case |= {"native": native_rate, "batched": batched_rate, "diffrigid": diffrigid_rate}[kind(case["engine"])](
+        scenes, case
+    )
     return case | {"rate": len(scenes) * scenes[0].steps / case["seconds"]}
 
 
 def run_in_process(case):
     """The case with its figures, from a process of its own (pinned as this one), or why there are none."""
-    if importlib.util.find_spec(case["engine"]) is None:
+    if case["engine"] in PEERS and PEERS[case["engine"]].package not in VERSIONS:
         return case | {"error": "not installed"}
     env = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_X64": "0", "JAX_ENABLE_COMPILATION_CACHE": "0"}
     env["JAX_TRACEBACK_FILTERING"] = "off"  # else an error does not come last
     command = [sys.executable, __file__, "--case", json.dumps(case)]
-    done = subprocess.run(command, env=env, capture_output=True, text=True)
+    try:
+        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=MAX_SECONDS)
+    except subprocess.TimeoutExpired:
+        return case | {"error": f"over {MAX_SECONDS} s"}
     if done.returncode:
         return case | {"error": (done.stderr.splitlines() or [f"exit status {done.returncode}"])[-1]}
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def measure(name, **options):
-    best, rows, scene = 0.0, [], SCENES[name](0)
-    peer_worlds = min(PEER_WORLDS, -(-PEER_BODIES // len(scene.x)))
-    for engine, worlds in [(peer, peer_worlds) for peer in scene.peers] + [("diffrigid", n) for n in scene.worlds]:
-        case = {"scene": name, "engine": engine, "worlds": worlds} | options
-        row = run_in_process(case)
-        if engine in PEERS:
-            best = max(best, row.get("rate", 0.0))
-        elif best and "rate" in row:
-            row["over_peer"] = row["rate"] / best
-        text = ROW.format_map(defaultdict(lambda: math.nan, row)).replace("nan", "  -")
-        text = row.get("error") or text + str(row["sanity"])
-        print(f"{name:5} {engine:9} {worlds:6} {text}", flush=True)
-        rows.append(row)
+    scene, rows, best = SCENES[name](0), [], {}  # rates of the best native and the best batched peer
+    few = min(PEER_WORLDS, -(-PEER_BODIES // len(scene.x)))
+    batches = {"native": (few,), "batched": BATCHES, "diffrigid": scene.worlds}
+    for engine in [*peers_of(scene), "diffrigid"]:
+        of, last = kind(engine), 0.0
+        for worlds in batches[of]:
+            if of == "batched" and last and scene.steps * worlds / last > MAX_RUN:
+                break
+            row = run_in_process({"scene": name, "engine": engine, "worlds": worlds} | options)
+            rate = row.get("rate", 0.0)
+            if engine == "diffrigid":
+                row |= {f"over_{peer}": rate / best[peer] for peer in best if rate}
+            elif rate and row["sanity"]["ok"]:
+                best[of] = max(best.get(of, 0.0), rate)
+            print(line(row), flush=True)
+            rows.append(row)
+            if of == "batched" and rate <= last:
+                break
+            last = rate
     return rows
 
 
 def machine():
     cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     cpu = re.search(r"model name\s*: (.*)|$", cpuinfo)[1]
-    packages = ("diffrigid", "jax", "jaxlib", "numpy", *PEERS)
-    versions = {d.name: d.version for d in distributions() if d.name in packages}
-    versions |= {"python": sys.version.split()[0], "XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
+    versions = VERSIONS | {"python": sys.version.split()[0], "XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
     return {"date": time.strftime("%Y-%m-%d"), "cpu": cpu, "versions": versions}
 
 
@@ -155,6 +186,8 @@ def main():
     parser.add_argument("--plain", action="store_true", help="without `dr.compile_for_speed`")
     parser.add_argument("--runs", type=int, default=5, help="the least in a median")
     parser.add_argument("--core", type=int, help="core to pin to; the last one unless told")
+    parser.add_argument("--figure", type=Path, help="draw the rates to this file")
+    parser.add_argument("--measured", action="store_true", help="table and figure of what OUT holds, nothing measured")
     parser.add_argument("--case", type=json.loads, help=argparse.SUPPRESS)  # one case, in this process
     args = parser.parse_args()
     if args.case:
@@ -163,9 +196,21 @@ def main():
         args.core = max(os.sched_getaffinity(0)) if args.core is None else args.core
         os.sched_setaffinity(0, {args.core})
     print(HEADER)
-    options = {"runs": args.runs, "forward": args.forward, "plain": args.plain}
-    rows = [row for name in args.scenes.split(",") for row in measure(name, **options)]
-    args.out.write_text(json.dumps(machine() | {"core": args.core, "cases": rows}, indent=1) + "\n")
+    if args.measured:
+        rows = json.loads(args.out.read_text())["cases"]
+        print(*map(line, rows), sep="\n")
+        return report(rows, args.figure)
+    rows = []
+    for name in args.scenes.split(","):
+        rows += measure(name, runs=args.runs, forward=args.forward or name in LONG, plain=args.plain)
+        args.out.write_text(json.dumps(machine() | {"core": args.core, "cases": rows}, indent=1) + "\n")
+    report(rows, args.figure)
+
+
+def report(rows, figure):
+    print(summary(rows))
+    if figure:
+        draw(rows, figure)
 
 
 if __name__ == "__main__":
