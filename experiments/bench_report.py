@@ -56,23 +56,22 @@ def fastest(rows, key):
 
 def summary(rows):
     """In Markdown: the fastest batch of diffrigid beside the fastest peers whose bodies end as they should."""
-    best = fastest(
-        (row for row in rows if row.get("sanity", {}).get("ok")), lambda row: (row["scene"], kind(row["engine"]))
-    )
+    right = [row for row in rows if row.get("sanity", {}).get("ok")]
+    best = fastest(right, lambda row: (row["scene"], kind(row["engine"])))
     lines = [COLUMNS, ["---"] * len(COLUMNS)]
-    for scene in dict.fromkeys(row["scene"] for row in rows if (row["scene"], "diffrigid") in best):
+    for scene in dict.fromkeys(row["scene"] for row in right if row["engine"] == "diffrigid"):
         ours = best[scene, "diffrigid"]
         cells = [title(scene), f"{short(ours['rate'])} ({ours['worlds']})"]
         for of in ("native", "batched"):
-            peer = best.get((scene, of))
-            worlds = f" ({peer['worlds']})" if peer and of == "batched" else ""
-            cells += (
-                [f"{peer['engine']} {short(peer['rate'])}{worlds}", f"{ours['rate'] / peer['rate']:.2g}"]
-                if peer
-                else "--"
-            )
+            cells += beside(ours, best[scene, of]) if (scene, of) in best else ["-", "-"]
         lines.append(cells + [f"{ours.get('grad_over_forward', math.nan):.1f}".replace("nan", "-")])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def beside(ours, peer):
+    worlds = f" ({peer['worlds']})" if kind(peer["engine"]) == "batched" else ""
+    ratio = float(f"{ours['rate'] / peer['rate']:.2g}")
+    return [f"{peer['engine']} {short(peer['rate'])}{worlds}", f"{ratio:g}"]
 
 
 def draw(rows, path):

@@ -1,7 +1,7 @@
 """How many world-steps a second does one core reach beside nine other engines, and what does a gradient cost?
 
     python experiments/throughput.py [--scenes S1,S2] [--forward] [--plain] [--runs 5] [--out FILE] [--core N]
-        [--figure FILE] [--measured]
+        [--cpu] [--figure FILE] [--measured]
 
 One core; each case in a process of its own, so that compile time and peak memory are its own. A world-step is
 one step of one world, whatever its sub-steps. The native engines step their worlds in turn, from Python or, MuJoCo,
@@ -39,9 +39,10 @@ from bench_scenes import SCENES, build_diffrigid
 
 MIN_SECONDS = 1.0  # a median is over at least so much time, after a warm-up
 MAX_SECONDS = 900  # of a case
-MAX_RUN = 20.0  # [s] that a larger batch may take at the rate of the one before
+MAX_RUN = 30.0  # [s] that a larger batch may take at the rate of the one before
 PEER_WORLDS, PEER_BODIES = 32, 1024  # worlds in a timed run, but no more than so many bodies; Box2D holds 128 worlds
 BATCHES = (1, 64, 1024)  # of the batched peers, as long as the rate grows
+CLOCKS = {False: time.perf_counter, True: time.process_time}
 LONG = ("S3", "S4")  # their gradients take many minutes to compile
 PACKAGES = {peer.package for peer in PEERS.values()} | {"diffrigid", "jax", "jaxlib", "numpy"}
 VERSIONS = {d.name: d.version for d in distributions() if d.name in PACKAGES}
@@ -53,6 +54,7 @@ def native_rate(scenes, case):
         case["runs"],
         lambda worlds: [peer.run(w, scenes[0]) for w in worlds],
         prepare=lambda: [peer.build(s) for s in scenes],
+        clock=CLOCKS[case["cpu"]],
     )
     return row | {"sanity": scenes[0].check(*peer.read(ends[0], scenes[0]))}
 
@@ -69,7 +71,7 @@ def batched_rate(scenes, case):
     def roll(states):
         return jax.lax.scan(lambda s, _: (jax.vmap(step)(s), None), states, None, length=scenes[0].steps)[0]
 
-    end, row = timed_jit(case["runs"], roll, start)
+    end, row = timed_jit(case, roll, start)
     return row | {"sanity": scenes[0].check(*read(jax.tree.map(lambda leaf: leaf[0], end)))}
 
 
@@ -88,47 +90,47 @@ def diffrigid_rate(scenes, case):
     def roll(v, world, states):
         return dr.rollout_batch(world, replace(states, v=v), dt=scenes[0].dt, steps=scenes[0].steps, final_only=True)
 
-    end, row = timed_jit(case["runs"], roll, v, world, states)
+    end, row = timed_jit(case, roll, v, world, states)
     sanity = scenes[0].check(end.x[0].tolist(), end.v[0].tolist()) | {"dtype": str(end.x.dtype)}
     if case["forward"]:
         return row | {"sanity": sanity}
     jax.clear_caches()  # what was traced for the forward run must not shorten the gradient's compile time
     loss = jax.value_and_grad(lambda *args: jnp.sum(roll(*args).x ** 2))
-    (_, grad), grad_row = timed_jit(case["runs"], loss, v, world, states)
+    (_, grad), grad_row = timed_jit(case, loss, v, world, states)
     sanity |= {"grad_finite": bool(jnp.isfinite(grad).all())}
     row |= {f"grad_{key}": value for key, value in grad_row.items()}
     return row | {"grad_over_forward": row["grad_seconds"] / row["seconds"], "sanity": sanity}
 
 
-def timed_jit(runs, function, *args):
+def timed_jit(case, function, *args):
     import jax
 
-    start = time.perf_counter()
+    clock = CLOCKS[case["cpu"]]
+    start = clock()
     compiled = jax.jit(function).lower(*args).compile()
-    seconds = time.perf_counter() - start
-    result, row = timed(runs, lambda _: jax.block_until_ready(compiled(*args)))
+    seconds = clock() - start
+    result, row = timed(case["runs"], lambda _: jax.block_until_ready(compiled(*args)), clock=clock)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # [MB] on Linux, kB on macOS
     temporaries = compiled.memory_analysis().temp_size_in_bytes / 1e6
     return result, row | {"compile_s": seconds, "peak_rss_mb": peak, "temp_mb": temporaries}
 
 
-def timed(runs, run, prepare=lambda: None):
+def timed(runs, run, prepare=lambda: None, clock=time.perf_counter):
     """A result of run(prepare()); median time (of run alone) and the distance of the quartiles over it."""
     result, times = run(prepare()), []
     while len(times) < runs or sum(times) < MIN_SECONDS:
         argument = prepare()
-        start = time.perf_counter()
+        start = clock()
         run(argument)
-        times.append(time.perf_counter() - start)
+        times.append(clock() - start)
     low, median, high = statistics.quantiles(times, n=4, method="inclusive") if len(times) > 1 else times * 3
     return result, {"seconds": median, "quartile_spread": (high - low) / median, "runs": len(times)}
 
 
 def run_case(case):
     scenes = [SCENES[case["scene"]](world) for world in range(case["worlds"])]
-    case |= {"native": native_rate, "batched": batched_rate, "diffrigid": diffrigid_rate}[kind(case["engine"])](
-        scenes, case
-    )
+    rates = {"native": native_rate, "batched": batched_rate, "diffrigid": diffrigid_rate}
+    case |= rates[kind(case["engine"])](scenes, case)
     return case | {"rate": len(scenes) * scenes[0].steps / case["seconds"]}
 
 
@@ -184,6 +186,7 @@ def main():
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     parser.add_argument("--forward", action="store_true", help="no gradients")
     parser.add_argument("--plain", action="store_true", help="without `dr.compile_for_speed`")
+    parser.add_argument("--cpu", action="store_true", help="CPU time, where other work shares the core")
     parser.add_argument("--runs", type=int, default=5, help="the least in a median")
     parser.add_argument("--core", type=int, help="core to pin to; the last one unless told")
     parser.add_argument("--figure", type=Path, help="draw the rates to this file")
@@ -202,8 +205,10 @@ def main():
         return report(rows, args.figure)
     rows = []
     for name in args.scenes.split(","):
-        rows += measure(name, runs=args.runs, forward=args.forward or name in LONG, plain=args.plain)
-        args.out.write_text(json.dumps(machine() | {"core": args.core, "cases": rows}, indent=1) + "\n")
+        rows += measure(name, forward=args.forward or name in LONG, plain=args.plain, runs=args.runs, cpu=args.cpu)
+        args.out.write_text(
+            json.dumps(machine() | {"core": args.core, "cpu_time": args.cpu, "cases": rows}, indent=1) + "\n"
+        )
     report(rows, args.figure)
 
 
