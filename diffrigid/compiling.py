@@ -54,7 +54,7 @@ def compile_for_speed() -> None:
 
     A loop, and so a rollout, is then one function, where XLA makes one of every few operations: two to seven times as
     fast for a single world, 1.2 to 2.2 times for a batch. Compiling takes hardly longer in 2D. In 3D it takes half as
-    long again, three times for a Jacobian's column and five times for a gradient. A fit, most of whose time is that of
+    long again, twice for a Jacobian's column and three times for a gradient. A fit, most of whose time is that of
     compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
 
     Raises:
