@@ -101,8 +101,7 @@ def rollout(
         controls: values (T, D or A, *batch) that forces with a `control` add, by its name; held over each interval.
         memory: [bytes] that reverse mode may use for saved states. If the states of all T steps do not fit, only about
             sqrt(T) are kept, and the steps between them are computed again. If all that a step of one world finds out
-            fits into a thousandth of it, no step is computed again, which compiles and runs in three quarters of the
-            time.
+            fits into a thousandth of it, no step is computed again, which takes a quarter less to compile.
 
     Raises:
         ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing; memory < 1;

@@ -418,7 +418,7 @@ def check_finite(made):
     return True
 
 
-# ---- files, which `test_properties` spoils
+# ---- files, which `test_nonsense` spoils
 
 
 SCENE = """
