@@ -239,6 +239,7 @@ REFUSED = {
     "frame": (mjcf("<frame/>" + BALL), "<frame> in 'world' cannot be loaded"),
     "global": (mjcf(BALL, '<compiler coordinate="global"/>'), "expected local"),
     "a file that is cut short": ('<mujoco><include file="part.xml"/></mujoco>', "part.xml is no XML file"),
+    "a rope of 300 bodies": (mjcf('<body><joint/><geom size="1"/>' * 300 + "</body>" * 300), "is inside 200 elements"),
     "circle of files": ('<mujoco><include file="model.xml"/></mujoco>', "includes itself"),
 }  # fmt: skip
 

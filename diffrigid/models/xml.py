@@ -8,12 +8,14 @@ import numpy as np
 
 from diffrigid.convert import largest
 
+DEEPEST = 200  # elements inside each other: a limit of Python's, which reads them one inside the other
+
 
 def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
     """The root of a file; whatever it is called if `root` is None.
 
     Raises:
-        ValueError: it is no XML, or its root is called otherwise.
+        ValueError: it is no XML, its root is called otherwise, or elements are too deep inside each other.
     """
     try:
         found = ElementTree.parse(Path(path)).getroot()  # a Path, for a number would be an open file
@@ -21,6 +23,11 @@ def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
         raise ValueError(f"{path} is no XML file: {error}") from None
     if root is not None and found.tag != root:
         raise ValueError(f"{path} starts with <{found.tag}>: expected <{root}>.")
+    level = [found]
+    for _ in range(DEEPEST):
+        level = [child for element in level for child in element]
+    if level:
+        raise ValueError(f"{path}: <{level[0].tag}> is inside {DEEPEST} elements: expected fewer; divide the chain.")
     return found
 
 
