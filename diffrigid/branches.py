@@ -45,3 +45,12 @@ def unfused(live: Array, fn: Callable, *args: Any) -> Any:
 
     once = jax.jit(fn)  # traced once for both
     return lax.cond(live, once, never, *args)
+
+
+def choose(chosen: Array, new: Any, old: Any) -> Any:
+    """By world, or for all of them, one of two trees: chosen (*batch) or () bool, leaves (..., *batch)."""
+
+    def one(new: Array, old: Array) -> Array:
+        return new if new is old else jnp.where(jnp.broadcast_to(chosen, new.shape), new, old)
+
+    return jax.tree.map(one, new, old)

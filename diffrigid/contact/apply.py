@@ -22,6 +22,7 @@ from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.linkage import Linkage, ends_of, islands, linkage, spread
+from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.pytree import replace
 from diffrigid.state import State, rotations
 
@@ -67,14 +68,28 @@ def apply_impulses(
     friction = None if known is None else reversing(mobility, strikes, P, (dv, dw), law, held_for)
     early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
     moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
-    kept = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
-    kept = kept + keeping_spin(strikes, drift_after(strikes, dv), early_P, moving)
+    pushed = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
+    kept = _no_faster_than_drift(mobility, pushed, strikes) + keeping_spin(
+        strikes, drift_after(strikes, dv), early_P, moving
+    )
     kicked = kick * dv, kick * dL + kept
     if onto is not None:
         kicked = kicked[0] + onto[0], kicked[1] + onto[2]
     # The path from where a body was held until, followed backwards, is its own but to second order.
     since = jnp.where(count > 0, jnp.where((kick > 0) & (evenly > 0), flight.t0, t), anchors.since)
     return _anchored(flight, t, q, since, kicked, moved), friction, load
+
+
+def _no_faster_than_drift(mobility: Mobility, dL: Array, strikes: Strikes) -> Array:
+    """dL (N, A, *batch), lessened where a rim would gain more than bodies drift apart, and none where some are deep.
+
+    Bodies that are so deep inside each other that no displacement is enough press without bound, which makes energy.
+    """
+    dw = jax.vmap(rotations(strikes.drift.shape[1]).apply)(mobility.inverse_inertia, dL)
+    rim = safe_sqrt((mobility.inverse_mass * (dL * dw).sum(1)).max(0))  # of as much energy as the turn
+    deep = (strikes.active & (strikes.gap < -strikes.deepest)).any(0)
+    most = jnp.where(deep, 0.0, 2.0 * jax.vmap(norm)(strikes.drift).max(0))
+    return jnp.where(rim > most, safe_divide(most, rim), 1.0)[None, None] * dL
 
 
 def _solved(

@@ -6,7 +6,8 @@ which never gain any:
     P = P0 + kappa Q,   Q = P_both - P0,   T = P . (v_rel + W P / 2) <= 0,   the largest such kappa <= 1
 
 Normal velocities are those of Newton's law on the whole way, and the cone of friction is convex. Contacts that hang
-together through bodies share their kappa.
+together through bodies share their kappa. Bodies that are deep inside each other may ask for what no impulses can do:
+then P0 gains as well, and is lessened likewise, from no impulse at all.
 Source: Kane & Levinson, Dynamics: Theory and Applications (1985), for the gain.
 """
 
@@ -25,37 +26,49 @@ from diffrigid.numerics import dot
 from diffrigid.pytree import replace
 
 
-def solve_without_gain(cone: Cone, v_rel: Array, guess: Array, arms: Arms, mobility: Mobility) -> Array:
-    """Impulses of contacts that share bodies, (C, D, *batch) [N s]; arguments as of `solve_together`.
+def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms: Arms, mobility: Mobility) -> Array:
+    """Impulses of contacts that share bodies, (C, D, *batch) [N s]; other arguments as of `solve_together`.
 
     Differentiable as these are, but where the bound on energy begins to act.
+
+    Args:
+        deep: (C, *batch) bool: contacts of bodies that are deep inside each other.
     """
-    bounces = jnp.where(cone.target > 0, cone.on, 0.0)
+    may_gain = jnp.where((cone.target > 0) | deep, cone.on, 0.0)
     if cone.most is not None:
-        bounces = jnp.where(jnp.isinf(cone.most), bounces, 0.0)
-    any_bounce = any_world(bounces > 0)
+        may_gain = jnp.where(jnp.isinf(cone.most), may_gain, 0.0)
+    any_may = any_world(may_gain > 0)
+
+    def rounding(P: Array) -> Array:
+        return jnp.finfo(P.dtype).eps ** 0.6 * jnp.abs(P * v_rel).sum((0, 1))[None]
 
     def gaining(P: Array) -> Array:
         P, v = lax.stop_gradient((P, v_rel))
         T = jax.vmap(dot)(P, v + 0.5 * lax.stop_gradient(moved(P, arms, mobility)))
-        least = jnp.finfo(v.dtype).eps ** 0.6 * jnp.abs(P * v).sum((0, 1))
-        over, struck = _summed(cone, arms, mobility, T, lax.stop_gradient(bounces))
-        return any_world((over > least[None]) & (struck > 0))
+        over, suspect = _summed(cone, arms, mobility, T, lax.stop_gradient(may_gain))
+        return any_world((over > lax.stop_gradient(rounding(P))) & (suspect > 0))
 
     def one(needed: Array, rough: Array) -> tuple[Array, tuple[Array, Array]]:
         spin = None if cone.spin is None else rough * cone.spin
         P = solve_together(needed, replace(cone, mu=rough * cone.mu, spin=spin), v_rel, guess, arms, mobility)
-        gains = lax.cond(any_bounce & (rough > 0), gaining, lambda _: jnp.asarray(False), P)
+        gains = lax.cond(any_may & (rough > 0), gaining, lambda _: jnp.asarray(False), P)
         return gains, (P, gains)
 
-    def between(P: Array, P0: Array) -> Array:
+    def towards(P0: Array, goal: tuple[Array, Array]) -> tuple[Array, None]:
+        P, allowance = goal
         both = jnp.stack([P0, P - P0])
         by_both = jax.vmap(lambda P: moved(P, arms, mobility))(both)
         factors = jnp.stack([v_rel + 0.5 * by_both[0], v_rel + by_both[0], by_both[1]], axis=1)
         terms = jnp.stack([P0, P - P0, P - P0], axis=1)
-        T0, b, c, struck = _summed(cone, arms, mobility, *jnp.moveaxis((terms * factors).sum(2), 1, 0), bounces)
-        kappa = jnp.where(struck > 0, within_energy(T0, b, c), 1.0)
-        return P0 + kappa[:, None] * both[1]
+        T0, b, c, suspect = _summed(cone, arms, mobility, *jnp.moveaxis((terms * factors).sum(2), 1, 0), may_gain)
+        gains = (suspect > 0) & (T0 + b + 0.5 * c > allowance * rounding(P))
+        kappa = jnp.where(gains, within_energy(T0, b, c), 1.0)
+        return P0 + kappa[:, None] * both[1], None
+
+    def between(P: Array, P0: Array) -> Array:
+        """By way of P0, which gains nothing but where there is no solution."""
+        goals = jnp.stack([P0, P]), jnp.array([1.0, 0.0], P.dtype)
+        return lax.scan(towards, jnp.zeros_like(P), goals)[0]
 
     # Both solutions in one loop, so that the method is compiled once.
     _, ((P, P0), (gains, _)) = lax.scan(one, any_world(cone.on > 0), jnp.array([1.0, 0.0], v_rel.dtype))

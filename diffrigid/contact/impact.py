@@ -18,8 +18,9 @@ from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide.profile import on_next_segments
+from diffrigid.contact.gaps import NEAR, at_corners
 from diffrigid.contact.order import Meeting
-from diffrigid.contact.search import NEAR, approach_search, at_corners, if_smooth, touches
+from diffrigid.contact.search import approach_search, if_smooth, touches
 from diffrigid.contact.sides import (
     Side,
     centre,

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.branches import any_world
+from diffrigid.branches import any_world, choose
 from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.apply import apply_impulses
 from diffrigid.contact.crowd import step_crowd
@@ -182,11 +182,11 @@ def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) 
         if known is None:
             return applied(None)[0], None
         nothing = jax.tree.map(jnp.zeros_like, known)
-        after, friction, load = applied(_choice(unused, nothing, known))
-        friction = _choice(phase == HOLD, friction, nothing)
+        after, friction, load = applied(choose(unused, nothing, known))
+        friction = choose(phase == HOLD, friction, nothing)
         reverses, load = friction.reverses(), jnp.where(impact | push, 0.0, load)
         following = replace(friction, P=jnp.where(reverses, friction.P, load))
-        return _choice(reverses, anchors, after), _choice(skips, known, following)
+        return choose(reverses, anchors, after), choose(skips, known, following)
 
     any_now = any_world(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
@@ -222,7 +222,8 @@ def _demanded(
     of_impact = jnp.where(stays, 0.0, restitution * u)
     target, force = driving(world, jnp.where(held, of_rest, of_impact))
     most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)
-    v_rel = jnp.where(push, strikes.gap[:, None] * strikes.normal, strikes.v_rel)
+    apart = jnp.maximum(strikes.gap, -strikes.deepest)
+    v_rel = jnp.where(push, apart[:, None] * strikes.normal, strikes.v_rel)
     law = Law(target, jnp.where(push, 0.0, friction), most)
     now = held | (strikes.active & strikes.now)
     return replace(strikes, active=now, held=held, v_rel=v_rel), law, held_for, resting
@@ -250,8 +251,3 @@ def _fallen(world: Any, flight: Flight, closing: Array, dt: Array) -> Array:
     """Speed (C, *batch) [m/s] to which what rested has closed at most after a step of free fall of both bodies."""
     fall = dt * jnp.sqrt((flight.a**2).sum(1).max(0))
     return world.contact.rest_speed[None] + 2.0 * jnp.maximum(fall[None], closing * dt[None])
-
-
-def _choice(chosen: Array, new: Any, old: Any) -> Any:
-    """By world, or for all of them: (*batch) or (), and two trees."""
-    return jax.tree.map(lambda a, b: jnp.where(jnp.broadcast_to(chosen, a.shape), a, b), new, old)

@@ -24,6 +24,7 @@ class Strikes:
     s: Array = array("C")  # (C, *batch) [s]
     gap: Array = array("C")  # [m]
     rounding: Array = array("C")  # [m] up to which a gap may be open by it
+    deepest: Array = array("C")  # [m] that one step pushes apart what is inside each other
     normal: Array = array("C", "D")  # from b to a
     arm_a: Array = array("C", "D")  # [m] contact point from the centre of mass of a, world axes
     arm_b: Array = array("C", "D")
@@ -88,7 +89,8 @@ def solve_impulses(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, mid_a=strikes.mid_a, mid_b=strikes.mid_b, turn=strikes.turn,
         jac=strikes.jac, mid_jac=strikes.mid_jac, spin=strikes.spin, a=strikes.a, b=strikes.b,
     )  # fmt: skip
-    return alone + solve_without_gain(cone, strikes.v_rel, guess, arms, mobility)
+    deep = strikes.gap < -strikes.deepest
+    return alone + solve_without_gain(cone, deep, strikes.v_rel, guess, arms, mobility)
 
 
 def barely(strikes: Strikes, rest_speed: Array) -> Array:

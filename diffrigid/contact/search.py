@@ -1,60 +1,129 @@
 """When any two shapes meet: conservative advancement towards the first contact, then the parabola of its gap.
 
 Searched without derivatives; `impact.py` gives the time that is found that of the implicit function theorem.
+The gaps are most of the program, so that they are evaluated in one place, in one loop, and each pair of each world then
+goes on in the stage that it has come to:
+
+    ADVANCING    by what no contact can close earlier, until one is near and closing, or the step is over
+    NEARING      towards the closest approach of the two paths, which sets the level of a smooth impact
+    POLISHING    along the parabola of the gap, to where it is at its level
+
 Source: Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems (1996), for the advancement.
 """
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.branches import any_world, opaque_true
-from diffrigid.collide import Contacts
+from diffrigid.branches import any_world, choose, opaque_true
 from diffrigid.collide.heights import height_over, unseen_for
-from diffrigid.contact.sides import (
-    Placed,
-    Side,
-    candidates_of,
-    centre,
-    earliest,
-    gap_rates,
-    place,
-    reach_of,
-    relative_acceleration,
-)
+from diffrigid.contact.gaps import NEAR, Gaps, gaps_at
+from diffrigid.contact.sides import Side, centre, earliest, reach_of
 from diffrigid.gathers import MANY, fold
-from diffrigid.numerics import FOUND, dot, norm, safe_divide, safe_sqrt, softplus
-from diffrigid.shapes import HalfSpace, HeightField, radius, vertices
+from diffrigid.numerics import FOUND, norm, safe_divide, safe_sqrt, softplus
+from diffrigid.shapes import HeightField
 from diffrigid.state import rotations
 
 CROSSED = 3  # advances for each node along a side of a grid: the length of its diagonal in half cells
 ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
 POLISH = 6  # steps along the local parabola of the gap; error squared by each
+TURN = 3  # evaluations for one step towards the closest approach, of which there are no more than POLISH
 ROUNDING = 1e5  # [-] of the last digit of NEAR: how far rounding of their places may hold bodies apart
-NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over to polishing
+ADVANCING, NEARING, POLISHING, DONE = range(4)
+
+
+class Task(NamedTuple):
+    """What is searched: the first impact of two colliders from `start` to t1."""
+
+    a: Side
+    b: Side
+    start: Array  # (*batch) [s]
+    t1: Array  # (*batch) [s]
+    size: Array  # (*batch) [m] the smaller reach
+    slow: Array  # (*batch) [m/s] contacts that close no faster rest
+    width: Array | None  # (*batch) [m] None: exact
+
+    @property
+    def span(self) -> Array:
+        """(*batch) [s]"""
+        return self.t1 - self.start
+
+    @property
+    def slack(self) -> Array:
+        """What is small beside 1: the root of rounding."""
+        return jnp.sqrt(jnp.finfo(self.t1.dtype).eps)
+
+
+class Closest(NamedTuple):
+    """The closest approach, of the contact with the least gap."""
+
+    t: Array  # (*batch) [s]
+    chosen: Array  # (K, *batch) 1 for that contact, else 0
+    gap: Array  # (*batch) [m] at t
+    rate: Array  # (*batch) [m/s] at t
+    before: Array  # (*batch) [m/s] a quarter of the step before
+
+
+class Search(NamedTuple):
+    """How far it has come."""
+
+    count: Any  # int: evaluations
+    stage: Array  # (*batch) int
+    tries: Array  # (*batch) int: evaluations in this stage
+    s: Array  # (*batch) [s] of the next evaluation; at last where they meet
+    rests: Array  # (K, *batch) bool: contacts that rest, which are left out
+    near: Array  # (*batch) [s] where the advances ended
+    found: Array  # (*batch) bool: some contact is at its level
+    inside: Array  # (*batch) bool: some contact was within its level and closing when the advances ended
+    level: Array  # (*batch) [m]
+    closest: Closest | None
 
 
 def approach_search(
     a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array, at_end: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Any two shapes: conservative advancement to the neighbourhood, then the parabola of the next contact.
+    """Any two shapes: time of the next impact, level of the gap then, whether there is one, which contacts rest.
 
-    Nothing is looked for `at_end`, a bool.
+    Nothing is looked for `at_end`, a bool. Only the level has a gradient.
     """
-    start, bound = earliest(a, b)
-    frozen_a, frozen_b = lax.stop_gradient((a, b))
-    size = jnp.minimum(reach_of(a), reach_of(b))
-    near, rests = _advance(frozen_a, frozen_b, start, t1, size, lax.stop_gradient(rest_speed), at_end)
-    near, rests = checkpoint_name((near, rests), FOUND)
-    live = opaque_true(t1)
+    task = lax.stop_gradient(_task(a, b, t1, width, rest_speed))  # else the loop would carry tangents in vain
+    live, follow = opaque_true(t1), _follower(task)
+    start = jnp.where(at_end, task.t1, task.start)
 
-    def smooth(near):
-        return _closest_level(a, b, near, t1 - start, width, live)  # type: ignore[arg-type]
+    def again(now: Search) -> Search:
+        return follow(now, gaps_at(task.a, task.b, now.s, live))
 
-    level = if_smooth(width, smooth, jnp.zeros_like, near)
-    s, found = _polish(frozen_a, frozen_b, near, lax.stop_gradient(level), size, start, t1, rests, at_end, live)
-    return jnp.where(s < bound, start, s), level, found, rests
+    def busy(now: Search) -> Array:
+        return ~at_end & any_world(now.stage < DONE)
+
+    count = len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start, live).gap))
+    end = lax.while_loop(busy, again, _beginning(start, count, width is not None))
+    level = jnp.zeros_like(start)
+    rests = checkpoint_name(end.rests, FOUND)
+    if end.closest is not None:
+
+        def smooth(t: Array) -> Array:
+            return _level(*_closest_approach(a, b, t, 0.25 * task.span, live), width)
+
+        level = if_smooth(width, smooth, jnp.zeros_like, checkpoint_name(end.closest.t, FOUND))
+    s, (_, bound) = jnp.where(end.found, end.s, end.near), earliest(task.a, task.b)
+    return jnp.where(s < bound, task.start, s), level, end.found | end.inside, rests
+
+
+def _task(a: Side, b: Side, t1: Array, width: Array | None, slow: Array) -> Task:
+    return Task(a, b, earliest(a, b)[0], t1, jnp.minimum(reach_of(a), reach_of(b)), slow, width)
+
+
+def _beginning(s: Array, count: int, smooth: bool) -> Search:
+    none, zero, no = jnp.zeros((count, *s.shape), s.dtype), jnp.zeros_like(s), jnp.zeros(s.shape, bool)
+    stage = jnp.full(s.shape, ADVANCING, np.int32)
+    closest = Closest(s, none, zero, zero, zero) if smooth else None
+    return Search(0, stage, jnp.zeros_like(stage), s, none > 0, s, no, no, zero, closest)
 
 
 def if_smooth(width: Array | None, smooth, exact, *args: Array) -> Array:
@@ -68,53 +137,39 @@ def touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array
     return (gap <= near) & (v * v + 2.0 * open_by * jnp.abs(acc) <= slow**2)
 
 
-def _motion(a: Side, b: Side, s: Array, live: Array) -> tuple[Array, Array, Array, Array | None]:
-    """Gaps of the contacts at s, (K, *batch) [m], their rates [m/s] and accelerations [m/s^2], and their normals."""
-    at_a, at_b = place(a, s, live), place(b, s, live)
-    if isinstance(b.shape, HalfSpace):
-        return *_corner_motion(a, at_a, b), None
-    contacts = candidates_of(a, at_a, b, at_b)
+def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
+    """What follows from the gaps at one time."""
+    safe_time = _advancer(task)
 
-    def pull(n, p):
-        return dot(n, relative_acceleration(at_a, at_b, p))
+    def follow(now: Search, gaps: Gaps) -> Search:
+        rests = jnp.where(now.count == 0, _resting(task, gaps), now.rests)
+        now = now._replace(count=now.count + 1, rests=rests)
+        now = choose(now.stage == ADVANCING, _advanced(task, now, safe_time(gaps, rests, now.s)), now)
+        following = choose(now.stage == POLISHING, _polished(task, now, gaps), now)
+        if task.width is None:
+            return following
+        nears = now.stage == NEARING  # at the same time as the last advance, or by itself
 
-    acceleration = jax.vmap(pull)(contacts.normal, contacts.point)
-    return contacts.gap, gap_rates(contacts, at_a, at_b), acceleration, contacts.normal
+        def nearer(following: Search) -> Search:
+            return choose(nears, _nearer(task, following, gaps), following)
+
+        return lax.cond(any_world(nears), nearer, lambda following: following, following)
+
+    return follow
 
 
-def _corner_motion(a: Side, at: Placed, b: Side) -> tuple[Array, Array, Array]:
-    """Heights of all corners of a above a half-space, (V, *batch) [m], their rates and accelerations.
+def _resting(task: Task, gaps: Gaps) -> Array:
+    """Contacts (K, *batch) that touch, or are about to, and close no faster than what is slow; bool.
 
-    In body axes the height of a corner r is n . x + N . r with N = R^T n; so are its derivatives, with those of N.
+    Beside one that rests, so do those slow enough to come to rest anyway. In unsupported flight they would always close
+    next, and hide the fast impact of another corner.
     """
-    dim = len(at.x)
-    so = rotations(dim)
-    normal = so.rotate(b.q, b.shape.normal)
-    r = _corners(a, dim)
-    turning = so.cross(at.w, normal)
-    axes = [normal, -turning, so.cross(at.w, turning) - so.cross(at.dw, normal)]
-    heights = [dot(normal, at.x - b.x) - b.shape.offset - radius(a.shape), dot(normal, at.v), dot(normal, at.a)]
-    height, rate, acceleration = (
-        h[None] + jax.vmap(dot, (None, 0))(so.unrotate(at.q, n), r) for h, n in zip(heights, axes, strict=True)
-    )
-    return height, rate, acceleration
-
-
-def at_corners(a: Side, at: Placed, contacts: Contacts, of_corners: Array) -> Array:
-    """What holds of corners of a, (V, *batch) bool, for contacts with a half-space at some of them, (K, *batch)."""
-    so, margin = rotations(len(at.x)), NEAR * reach_of(a)
-
-    def one(gap: Array, normal: Array, point: Array) -> Array:
-        corner = so.unrotate(at.q, point + (radius(a.shape) + 0.5 * gap)[None] * normal - at.x)
-        return (of_corners & (jax.vmap(norm)(_corners(a, len(at.x)) - corner[None]) <= margin[None])).any(0)
-
-    return lax.stop_gradient(jax.vmap(one)(contacts.gap, contacts.normal, contacts.point))
-
-
-def _corners(a: Side, dim: int) -> Array:
-    """Vertices of the core of a from its centre of mass, body axes, (V, D, *batch) [m]."""
-    r = vertices(a.shape, dim)
-    return r if a.offset is None else r + a.offset[None]
+    gap, v, acc, _ = gaps
+    near, slow = (NEAR * task.size)[None], task.slow[None]
+    touching = touches(gap, v, acc, near, slow)
+    # What closes by a third of its fall would be back within the step, whatever e <= 1.
+    least = slow + jnp.maximum(-acc, 0.0) * jnp.maximum(task.span, 0.0)[None] / 3.0
+    return touching | (touches(gap, v, acc, near, least) & touching.any(0)[None])
 
 
 def _time_to(height: Array, v: Array, acc: Array) -> Array:
@@ -127,26 +182,26 @@ def _time_to(height: Array, v: Array, acc: Array) -> Array:
     return jnp.where(sunk, 0.0, jnp.where(v < 0, closing, returning))
 
 
-def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array, at_end: Array) -> tuple[Array, Array]:
-    """Advance until a contact is near and closing, or the step is over; and which contacts (K, *batch) rest.
+def _advancer(task: Task) -> Callable[[Gaps, Array, Array], Array]:
+    """How long from s no contact can close that does not rest, (*batch) [s]; <= 0 if one is near and closing.
 
-    Contacts rest that touch, or are about to, and close no faster than `slow` [m/s]; beside one, so do those slow
-    enough to come to rest anyway. They are left out: in unsupported flight they would always close next, and hide the
-    fast impact of another corner.
-
-    Each advance is the least, over the contacts, of the gap over a bound on the closing speed for the present
-    normal (Mirtich 1996), so that a body that only translates arrives in one. The gap of a corner and a plane is
-    a smooth function of time: until t1 it stays above the parabola that is its own, bent down further by as much as its
-    third derivative can be, which takes two or three advances. A contact that touches and separates may be passed for
-    as long as its parabola stays open.
+    It is the least, over the contacts, of the gap over a bound on the closing speed for the present normal (Mirtich
+    1996), so that a body that only translates arrives in one advance. The gap of a corner and a plane is a smooth
+    function of time: until t1 it stays above the parabola that is its own, bent down further by as much as its third
+    derivative can be, which takes two or three advances. A contact that touches and separates may be passed for as long
+    as its parabola stays open.
     """
-    live, span, near = opaque_true(t1), jnp.maximum(t1 - start, 0.0), NEAR * size
-    (spin_a, jerk_a), (spin_b, jerk_b) = _unsteady(a, span), _unsteady(b, span)
+    a, b, t1, near = task.a, task.b, task.t1, NEAR * task.size
+    (spin_a, jerk_a), (spin_b, jerk_b) = (_unsteady(side, jnp.maximum(task.span, 0.0)) for side in (a, b))
     spinning, jerk = spin_a + spin_b, jerk_a + jerk_b
-    # Across a grid an advance ends after half a cell, or in contact.
-    most = ADVANCES + (CROSSED * sum(b.shape.heights.shape[:2]) if isinstance(b.shape, HeightField) else 0)
 
-    def safe_time(gap, v, acc, normal, rests, s):
+    def unseen(s: Array) -> Array:
+        x, v = centre(a, s)
+        height = height_over(b.shape, x, b.x, b.q) - reach_of(a)
+        return jnp.where(s < t1, unseen_for(b.shape, b.q, height, v, spinning), jnp.inf)
+
+    def safe_time(gaps: Gaps, rests: Array, s: Array) -> Array:
+        gap, v, acc, normal = gaps
         if normal is None:
             apart = _time_to(gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
         else:
@@ -157,29 +212,17 @@ def _advance(a: Side, b: Side, start: Array, t1: Array, size: Array, slow: Array
         first = _least(jnp.where(rests, jnp.inf, jnp.where(gap > near[None], apart, returns)))
         return jnp.minimum(first, unseen(s)) if isinstance(b.shape, HeightField) else first
 
-    def unseen(s):
-        x, v = centre(a, s)
-        height = height_over(b.shape, x, b.x, b.q) - reach_of(a)
-        return jnp.where(s < t1, unseen_for(b.shape, b.q, height, v, spinning), jnp.inf)
+    return safe_time
 
-    def busy(carry):
-        count, s, dt, _ = carry
-        return ~at_end & ((count == 0) | ((count < most) & any_world((dt > 0) & (s < t1))))
 
-    def advance(carry):
-        count, s, dt, rests = carry
-        onward = jnp.where(s < t1, jnp.minimum(s + jnp.maximum(dt, 0.0), t1), s)
-        gap, v, acc, normal = _motion(a, b, onward, live)
-        touching = touches(gap, v, acc, near[None], slow[None])
-        # Beside one that rests, what closes by a third of its fall: it would be back within the step, whatever e <= 1.
-        least = slow[None] + jnp.maximum(-acc, 0.0) * span[None] / 3.0
-        beside = touches(gap, v, acc, near[None], least) & touching.any(0)[None]
-        rests = jnp.where(count == 0, touching | beside, rests)
-        return count + 1, onward, safe_time(gap, v, acc, normal, rests, onward), rests
-
-    contacts = jax.eval_shape(lambda: _motion(a, b, start, live)[0]).shape
-    begin = jnp.where(at_end, t1, start)
-    return lax.while_loop(busy, advance, (0, begin, jnp.zeros_like(start), jnp.zeros(contacts, bool)))[1::2]
+def _advanced(task: Task, now: Search, dt: Array) -> Search:
+    """After an advance by dt; where there is none, or no more, the next stage begins."""
+    # Across a grid an advance ends after half a cell, or in contact.
+    grid = task.b.shape.heights.shape[:2] if isinstance(task.b.shape, HeightField) else ()
+    arrived = (dt <= 0) | (now.s >= task.t1) | (now.count >= ADVANCES + CROSSED * sum(grid))
+    following = POLISHING if task.width is None else jnp.where(task.width > 0, NEARING, POLISHING)
+    s = jnp.where(arrived, now.s, jnp.minimum(now.s + dt, task.t1))
+    return now._replace(s=s, near=now.s, stage=jnp.where(arrived, following, ADVANCING).astype(np.int32))
 
 
 def _least(times: Array) -> Array:
@@ -206,57 +249,64 @@ def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
     return 1.1 * w * reach + a * span, jerk
 
 
-def _polish(
-    a: Side, b: Side, s: Array, level: Array, size: Array, start: Array, t1: Array, rests: Array, at_end: Array,
-    live: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Time near s at which the first contact comes to gap = level, and whether one does; s if inside and closing.
-
-    Not of contacts that rest, (K, *batch) bool.
-    """
-    slack, near, span = jnp.sqrt(jnp.finfo(s.dtype).eps), s, t1 - start
-
-    def busy(carry):
-        count, _, dt, *_ = carry
-        return ~at_end & (count <= POLISH) & any_world(jnp.abs(dt) > slack * span)
-
-    def towards(carry):
-        count, s, _, _, inside = carry
-        gap, v, acc, _ = _motion(a, b, s, live)
-        height = gap - level[None]
-        there = (jnp.abs(height) <= 8.0 * slack**2 * size[None]) & (v < 0)  # to rounding
-        dt = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
-        dt = jnp.where(jnp.isfinite(dt) & ((dt < 0) | (s < t1 + slack * span)), dt, 0.0)  # what is later is no impact
-        at_level = (gap <= (level + slack * size)[None]) & ((v < 0) | (acc < 0)) & ~rests
-        inside = jnp.where(count == 0, ((gap <= level[None]) & (v < 0) & ~rests).any(0), inside)
-        return count + 1, s + dt, dt, at_level.any(0), inside
-
-    _, s, dt, found, inside = lax.while_loop(busy, towards, (0, s, jnp.inf + s, s < s, s < s))
+def _polished(task: Task, now: Search, gaps: Gaps) -> Search:
+    """After a step to where the first contact that does not rest comes to gap = level, if one does."""
+    (gap, v, acc, _), slack, small, level = gaps, task.slack, task.slack * task.span, now.level[None]
+    height = gap - level
+    there = (jnp.abs(height) <= 8.0 * slack**2 * task.size[None]) & (v < 0)  # to rounding
+    dt = _least(jnp.where(now.rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
+    dt = jnp.where(jnp.isfinite(dt) & ((dt < 0) | (now.s < task.t1 + small)), dt, 0.0)  # what is later is no impact
+    at_level = (gap <= level + (slack * task.size)[None]) & ((v < 0) | (acc < 0)) & ~now.rests
+    inside = ((gap <= level) & (v < 0) & ~now.rests).any(0)
+    done = (jnp.abs(dt) <= small) | (now.tries >= POLISH)
     # Where it converges the last step closes the gap, which at its start may have been wider than the slack.
-    found = found | ((dt != 0) & (jnp.abs(dt) <= slack * span))
-    return jnp.where(found, s, near), found | inside
+    found = at_level.any(0) | ((dt != 0) & (jnp.abs(dt) <= small))
+    return now._replace(
+        s=now.s + dt, found=found, inside=jnp.where(now.tries == 0, inside, now.inside), tries=now.tries + 1,
+        stage=jnp.where(done, DONE, POLISHING).astype(np.int32),
+    )  # fmt: skip
 
 
-def _closest_level(a: Side, b: Side, s: Array, span: Array, width: Array, live: Array) -> Array:
-    """Smooth level from the closest approach of the two paths, of the contact with the least gap at s.
+def _nearer(task: Task, now: Search, gaps: Gaps) -> Search:
+    """After one of three evaluations of a step towards the closest approach: at its time, before, and after it.
 
-    The curvature of the gap is a difference of its rate over a quarter of the step: it holds what corners and
-    turning faces add. The approach is sought without gradient, then evaluated with it.
+    The curvature of the gap is a difference of its rate over a quarter of the step: it holds what corners and turning
+    faces add.
     """
-    eta = 0.25 * span
+    eta, turn, c = 0.25 * task.span, now.tries % TURN, now.closest
+    assert c is not None
+    first, last = turn == 0, turn == TURN - 1
+    chosen = jnp.where(first[None], _deepest(gaps.gap), c.chosen)
+    t, rate = jnp.where(now.tries == 0, now.near, c.t), (chosen * gaps.rate).sum(0)
+    gap, before = jnp.where(first, (chosen * gaps.gap).sum(0), c.gap), jnp.where(last, c.before, rate)
+    c = Closest(t=t, chosen=chosen, gap=gap, rate=jnp.where(first, rate, c.rate), before=before)
+    curvature = safe_divide(rate - c.before, 2.0 * eta)
+    step = jnp.where(curvature > 0, safe_divide(c.rate, curvature), 0.0)
+    onward = jnp.clip(t - step, now.near - task.span, now.near + task.span)
+    ends = last & ((jnp.abs(onward - t) <= task.slack * task.span) | (now.tries >= TURN * POLISH))
+    c = c._replace(t=jnp.where(last & ~ends, onward, t))
+    s = jnp.where(ends, now.near, jnp.where(last, c.t, jnp.where(first, t - eta, t + eta)))
+    return now._replace(
+        s=s, closest=c, level=jnp.where(ends, _level(c.gap, c.rate, curvature, task.width), now.level),
+        tries=jnp.where(ends, 0, now.tries + 1), stage=jnp.where(ends, POLISHING, NEARING).astype(np.int32),
+    )  # fmt: skip
 
-    def least(a, b, s):
-        gaps, rates = jax.vmap(lambda t: _motion(a, b, t, live)[:2])(jnp.stack([s - eta, s, s + eta]))
-        chosen = jax.nn.one_hot(jnp.argmin(gaps[1], 0), gaps.shape[1], axis=0, dtype=s.dtype)
-        before, now, after = (chosen[None] * rates).sum(1)
-        return (chosen * gaps[1]).sum(0), now, safe_divide(after - before, 2.0 * eta)
 
-    def towards(_, t):
-        _, v, curvature = least(*lax.stop_gradient((a, b)), t)
-        return jnp.clip(t - jnp.where(curvature > 0, safe_divide(v, curvature), 0.0), s - span, s + span)
+def _deepest(gap: Array) -> Array:
+    """1 for the least of the gaps (K, *batch), else 0."""
+    return jax.nn.one_hot(jnp.argmin(gap, 0), len(gap), axis=0, dtype=gap.dtype)
 
-    closest = checkpoint_name(lax.stop_gradient(lax.fori_loop(0, POLISH, towards, s)), FOUND)
-    gap, v, curvature = least(a, b, closest)
+
+def _closest_approach(a: Side, b: Side, t: Array, eta: Array, live: Array) -> tuple[Array, Array, Array]:
+    """Gap at t of the contact with the least, its rate and its curvature, as in `_nearer` but with their gradients."""
+    gaps = jax.vmap(lambda t: gaps_at(a, b, t, live)[:2])(jnp.stack([t - eta, t, t + eta]))
+    chosen = _deepest(gaps[0][1])
+    before, rate, after = (chosen[None] * gaps[1]).sum(1)
+    return (chosen * gaps[0][1]).sum(0), rate, safe_divide(after - before, 2.0 * eta)
+
+
+def _level(gap: Array, rate: Array, curvature: Array, width: Any) -> Array:
+    """Level of a smooth impact, (*batch) [m], from a gap near its closest approach."""
     turns_back = curvature > 0
-    gap_min = gap - 0.5 * safe_divide(v * v, jnp.where(turns_back, curvature, 0.0))
+    gap_min = gap - 0.5 * safe_divide(rate * rate, jnp.where(turns_back, curvature, 0.0))
     return jnp.where(turns_back, softplus(gap_min, width), 0.0)

@@ -116,26 +116,26 @@ def _struck(
     if kind == "friction":
         never = jnp.zeros(dt.shape, bool)
         return Meeting(s=dt, hit=never | at_end, fast=never, rests=~never[None])
-    gap, start = _gap(kind, joint, a, b), jnp.maximum(a.t0, b.t0)
-    slack = jnp.sqrt(jnp.finfo(dt.dtype).eps)
-    free = lax.stop_gradient(gap(since)) > slack
-    inside = lax.stop_gradient(gap(dt)) < 0
+    gap, start, slack = _gap(kind, joint, a, b), jnp.maximum(a.t0, b.t0), jnp.sqrt(jnp.finfo(dt.dtype).eps)
+    (frozen_joint, *sides), begin, end = lax.stop_gradient(((joint, a, b), since, dt))
+    frozen = _gap(kind, frozen_joint, *sides)  # for the search: else it carries tangents in vain
+    free, inside = frozen(begin) > slack, frozen(end) < 0
 
     def closer(_, ends):
         low, high, s = ends
-        value, slope = _rate(gap, s)
+        value, slope = _rate(frozen, s)
         low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
         newton = s - value / jnp.where(slope != 0, slope, 1.0)
         within = (newton >= low) & (newton <= high) & (slope != 0)
         return low, high, jnp.where(within, newton, 0.5 * (low + high))
 
-    found = lax.fori_loop(0, SEARCH, closer, lax.stop_gradient((since, dt, 0.5 * (since + dt))))[2]
+    found = lax.fori_loop(0, SEARCH, closer, (begin, end, 0.5 * (begin + end)))[2]
     hit = inside & ~at_end
     s0 = checkpoint_name(lax.stop_gradient(jnp.where(hit & free, found, jnp.where(hit, start, dt))), FOUND)
     value, slope = _rate(gap, s0)
     slope = lax.stop_gradient(slope)
     s = jnp.where(hit & free, implicit_root(s0, value, slope), jnp.where(hit, start, dt))
-    at_start, closing = lax.stop_gradient(_rate(gap, start))
+    at_start, closing = _rate(frozen, lax.stop_gradient(start))
     rests = (at_start <= slack) & (jnp.abs(closing) <= rest_speed) & ~at_end
     return Meeting(s=s, hit=hit | at_end, fast=hit & (slope < -rest_speed), rests=rests[None])
 
@@ -169,9 +169,9 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
         pull = lax.stop_gradient(_second(gap, s))
     touches = ~meeting.held | meeting.rests[0] | (open_by <= jnp.sqrt(jnp.finfo(s.dtype).eps))
     return Strikes(
-        active=meeting.hit & touches, s=s, gap=open_by, rounding=0.0 * s, normal=first, arm_a=none, arm_b=none,
-        K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first,
-        pull=pull[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now,
+        active=meeting.hit & touches, s=s, gap=open_by, rounding=0.0 * s, deepest=jnp.full_like(s, jnp.inf),
+        normal=first, arm_a=none, arm_b=none, K=first[:, None] * first[None] * sum(mobile)[None, None],
+        v_rel=rate[None] * first, pull=pull[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now,
         held=meeting.held, jac=jac, mid_jac=mid_jac,
     )  # fmt: skip
 

@@ -29,6 +29,7 @@ from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
 
+DEEPEST = 0.2  # [-] of the smaller reach: what is deeper inside each other is pushed apart in several steps
 ROUNDING = 1e2  # [-] of the last digit of a size, or of a tenth of a place: gaps are not known any better
 
 
@@ -112,8 +113,9 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     active = (near | (meeting.rests & held[None])) & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
-    size = jnp.minimum(reach_of(a), reach_of(b)) + 0.1 * (jnp.abs(at_a.x).max(0) + jnp.abs(at_b.x).max(0))
-    rounding = ROUNDING * jnp.finfo(s.dtype).eps * lax.stop_gradient(size)
+    size = lax.stop_gradient(jnp.minimum(reach_of(a), reach_of(b)))
+    far = size + 0.1 * lax.stop_gradient(jnp.abs(at_a.x).max(0) + jnp.abs(at_b.x).max(0))
+    rounding = ROUNDING * jnp.finfo(s.dtype).eps * far
     T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
 
     def each(contact: Contacts, moving: Contacts | None) -> Strikes:
@@ -123,8 +125,8 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
         pulls: list[Any] = [acceleration(side, at, s, arm, lever.rate) for side, at, arm in arms]
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
         return Strikes(
-            active=gap < 0, s=s, gap=gap, rounding=rounding, normal=contact.normal, arm_a=lever.arm_a,
-            arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
+            active=gap < 0, s=s, gap=gap, rounding=rounding, deepest=DEEPEST * size, normal=contact.normal,
+            arm_a=lever.arm_a, arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
             K=effective_matrix(at_a, at_b, lever), v_rel=relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b),
             pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip

@@ -1,0 +1,72 @@
+"""How the gaps of a pair change along the paths of its colliders: what a search for their impact looks at."""
+
+from typing import NamedTuple
+
+import jax
+from jax import Array, lax
+
+from diffrigid.collide import Contacts
+from diffrigid.contact.sides import Placed, Side, candidates_of, gap_rates, place, reach_of, relative_acceleration
+from diffrigid.numerics import dot, norm
+from diffrigid.shapes import HalfSpace, radius, vertices
+from diffrigid.state import rotations
+
+NEAR = 1e-3  # [-] fraction of the smaller reach at which advancing hands over to polishing
+
+
+class Gaps(NamedTuple):
+    """K gaps at one time."""
+
+    gap: Array  # (K, *batch) [m]
+    rate: Array  # (K, *batch) [m/s]
+    acceleration: Array  # (K, *batch) [m/s^2]
+    normal: Array | None  # (K, D, *batch) None: that of a half-space
+
+
+def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
+    """The gaps of all contacts that an impact may be at, at time s (*batch) [s]."""
+    at_a, at_b = place(a, s, live), place(b, s, live)
+    if isinstance(b.shape, HalfSpace):
+        return _gaps_of_corners(a, at_a, b)
+    contacts = candidates_of(a, at_a, b, at_b)
+
+    def pull(n, p):
+        return dot(n, relative_acceleration(at_a, at_b, p))
+
+    acceleration = jax.vmap(pull)(contacts.normal, contacts.point)
+    return Gaps(contacts.gap, gap_rates(contacts, at_a, at_b), acceleration, contacts.normal)
+
+
+def _gaps_of_corners(a: Side, at: Placed, b: Side) -> Gaps:
+    """Of all corners of a above a half-space.
+
+    In body axes the height of a corner r is n . x + N . r with N = R^T n; so are its derivatives, with those of N.
+    """
+    dim = len(at.x)
+    so = rotations(dim)
+    normal = so.rotate(b.q, b.shape.normal)
+    r = _corners(a, dim)
+    turning = so.cross(at.w, normal)
+    axes = [normal, -turning, so.cross(at.w, turning) - so.cross(at.dw, normal)]
+    heights = [dot(normal, at.x - b.x) - b.shape.offset - radius(a.shape), dot(normal, at.v), dot(normal, at.a)]
+    height, rate, acceleration = (
+        h[None] + jax.vmap(dot, (None, 0))(so.unrotate(at.q, n), r) for h, n in zip(heights, axes, strict=True)
+    )
+    return Gaps(height, rate, acceleration, None)
+
+
+def at_corners(a: Side, at: Placed, contacts: Contacts, of_corners: Array) -> Array:
+    """What holds of corners of a, (V, *batch) bool, for contacts with a half-space at some of them, (K, *batch)."""
+    so, margin = rotations(len(at.x)), NEAR * reach_of(a)
+
+    def one(gap: Array, normal: Array, point: Array) -> Array:
+        corner = so.unrotate(at.q, point + (radius(a.shape) + 0.5 * gap)[None] * normal - at.x)
+        return (of_corners & (jax.vmap(norm)(_corners(a, len(at.x)) - corner[None]) <= margin[None])).any(0)
+
+    return lax.stop_gradient(jax.vmap(one)(contacts.gap, contacts.normal, contacts.point))
+
+
+def _corners(a: Side, dim: int) -> Array:
+    """Vertices of the core of a from its centre of mass, body axes, (V, D, *batch) [m]."""
+    r = vertices(a.shape, dim)
+    return r if a.offset is None else r + a.offset[None]
