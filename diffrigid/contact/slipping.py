@@ -109,9 +109,11 @@ def lost_to_stops(
     # Against the slip: what contacts of the same two wholes do against each other stops nothing.
     own = -jax.vmap(dot)(friction, at_end / jnp.where(at_end_speed > 0, at_end_speed, 1.0)[:, None])
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
-    size, bound = jnp.abs(in_all(strikes, slipping, own)), in_all(strikes, slipping, bounds)
-    most = jnp.minimum(size, most_to_stop)
-    own, size = own * safe_divide(most, size), most
+    total, bound = in_all(strikes, slipping, own), in_all(strikes, slipping, bounds)
+    size, sense = jnp.minimum(jnp.abs(total), most_to_stop), jnp.where(total < 0, -1.0, 1.0).astype(own.dtype)
+    # Shared by those that act in the sense of all: a share of what nearly cancels would be anything.
+    along_all = jnp.maximum(sense * own, 0.0)
+    own = sense * along_all * safe_divide(size, in_all(strikes, slipping, along_all))
     whole = at_end_speed * bound + size * (speed - along)
     stops = strikes.active & slipping & (size < STICKS * bound) & (T > 0)
     least = float(jnp.finfo(T.dtype).tiny) ** 0.5  # the derivative of a quotient divides by the square of this
