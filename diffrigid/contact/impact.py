@@ -18,9 +18,10 @@ from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide.profile import on_next_segments
+from diffrigid.contact.approach import if_smooth, touches
 from diffrigid.contact.gaps import NEAR, at_corners
 from diffrigid.contact.order import Meeting
-from diffrigid.contact.search import approach_search, if_smooth, touches
+from diffrigid.contact.search import approach_search
 from diffrigid.contact.sides import (
     Side,
     centre,

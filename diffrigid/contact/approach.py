@@ -1,0 +1,201 @@
+"""What the gaps of a pair at one time tell of its next impact: how long none can close, when one does, which rest.
+
+Source: Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems (1996), for the advancement.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.branches import any_world
+from diffrigid.collide.heights import height_over, unseen_for
+from diffrigid.contact.gaps import NEAR, Gaps, gaps_at
+from diffrigid.contact.sides import Side, centre, earliest, reach_of
+from diffrigid.gathers import MANY, fold
+from diffrigid.numerics import norm, safe_divide, safe_sqrt, softplus
+from diffrigid.shapes import HeightField
+from diffrigid.state import rotations
+
+ROUNDING = 1e5  # [-] of the last digit of NEAR: how far rounding of their places may hold bodies apart
+
+
+class Task(NamedTuple):
+    """What is searched: the first impact of two colliders from `start` to t1."""
+
+    a: Side
+    b: Side
+    start: Array  # (*batch) [s]
+    t1: Array  # (*batch) [s]
+    size: Array  # (*batch) [m] the smaller reach
+    slow: Array  # (*batch) [m/s] contacts that close no faster rest
+    width: Array | None  # (*batch) [m] None: exact
+
+    @property
+    def span(self) -> Array:
+        """(*batch) [s]"""
+        return self.t1 - self.start
+
+    @property
+    def slack(self) -> Array:
+        """What is small beside 1: the root of rounding."""
+        return jnp.sqrt(jnp.finfo(self.t1.dtype).eps)
+
+
+def task_of(a: Side, b: Side, t1: Array, width: Array | None, slow: Array) -> Task:
+    """Without derivatives: else a loop that searches would carry tangents in vain."""
+    task = Task(a, b, earliest(a, b)[0], t1, jnp.minimum(reach_of(a), reach_of(b)), slow, width)
+    return lax.stop_gradient(task)
+
+
+def if_smooth(width: Array | None, smooth, exact, *args: Array) -> Any:
+    """smooth(*args) if any width is positive, else exact(*args)."""
+    return exact(*args) if width is None else lax.cond(any_world(width > 0), smooth, exact, *args)
+
+
+def touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array:
+    """Whether a gap is closed, or about to close, no faster than `slow` [m/s]; rounding does not keep it open."""
+    open_by = jnp.maximum(gap - ROUNDING * jnp.finfo(gap.dtype).eps * near, 0.0)
+    return (gap <= near) & (v * v + 2.0 * open_by * jnp.abs(acc) <= slow**2)
+
+
+def resting(task: Task, gaps: Gaps) -> Array:
+    """Contacts (K, *batch) that touch, or are about to, and close no faster than what is slow; bool.
+
+    Beside one that rests, so do those slow enough to come to rest anyway. In unsupported flight they would always close
+    next, and hide the fast impact of another corner.
+    """
+    gap, v, acc, _ = gaps
+    near, slow = (NEAR * task.size)[None], task.slow[None]
+    touching = touches(gap, v, acc, near, slow)
+    # What closes by a third of its fall would be back within the step, whatever e <= 1.
+    least = slow + jnp.maximum(-acc, 0.0) * jnp.maximum(task.span, 0.0)[None] / 3.0
+    return touching | (touches(gap, v, acc, near, least) & touching.any(0)[None])
+
+
+def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:
+    """How long from s no contact can close that does not rest, (*batch) [s]; <= 0 if one is near and closing.
+
+    It is the least, over the contacts, of the gap over a bound on the closing speed for the present normal (Mirtich
+    1996), so that a body that only translates arrives in one advance. The gap of a corner and a plane is a smooth
+    function of time: until t1 it stays above the parabola that is its own, bent down further by as much as its third
+    derivative can be, which takes two or three advances. A contact that touches and separates may be passed for as long
+    as its parabola stays open.
+    """
+    a, b, t1, near = task.a, task.b, task.t1, NEAR * task.size
+    (spin_a, jerk_a), (spin_b, jerk_b) = (_unsteady(side, jnp.maximum(task.span, 0.0)) for side in (a, b))
+    spinning, jerk = spin_a + spin_b, jerk_a + jerk_b
+
+    def unseen(s: Array) -> Array:
+        x, v = centre(a, s)
+        height = height_over(b.shape, x, b.x, b.q) - reach_of(a)
+        return jnp.where(s < t1, unseen_for(b.shape, b.q, height, v, spinning), jnp.inf)
+
+    def clear(gaps: Gaps, rests: Array, s: Array) -> Array:
+        gap, v, acc, normal = gaps
+        if normal is None:
+            apart = _time_to(gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
+        else:
+            approach = centre(a, s)[1] - centre(b, s)[1]
+            bound = jnp.maximum(-(normal * approach[None]).sum(1), 0.0) + spinning[None]
+            apart = jnp.where(bound > 0, safe_divide(gap, bound), jnp.inf)
+        returns = jnp.where(v < 0, 0.0, _time_to(gap, v, acc))
+        first = _least(jnp.where(rests, jnp.inf, jnp.where(gap > near[None], apart, returns)))
+        return jnp.minimum(first, unseen(s)) if isinstance(b.shape, HeightField) else first
+
+    return clear
+
+
+class Polish(NamedTuple):
+    """A step along the parabola of the first gap to close, and what was seen before it."""
+
+    dt: Array  # (*batch) [s] until the first contact that does not rest comes to its level; 0 if none does
+    at_level: Array  # (*batch) bool: some contact is there
+    inside: Array  # (*batch) bool: some contact is within its level, and closing
+
+    def converged(self, task: Task) -> Array:
+        """(*batch) bool"""
+        return jnp.abs(self.dt) <= task.slack * task.span
+
+    def found(self, task: Task) -> Array:
+        """(*batch) bool. The last step closes the gap, which at its start may have been wider than the slack."""
+        return self.at_level | ((self.dt != 0) & self.converged(task))
+
+
+def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Polish:
+    """From time s (*batch) [s] to where a gap is `level` (*batch) [m]."""
+    (gap, v, acc, _), slack, level = gaps, task.slack, level[None]
+    height = gap - level
+    there = (jnp.abs(height) <= 8.0 * slack**2 * task.size[None]) & (v < 0)  # to rounding
+    dt = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
+    within = (dt < 0) | (s < task.t1 + slack * task.span)  # what is later is no impact
+    at_level = (gap <= level + (slack * task.size)[None]) & ((v < 0) | (acc < 0)) & ~rests
+    inside = (gap <= level) & (v < 0) & ~rests
+    return Polish(jnp.where(jnp.isfinite(dt) & within, dt, 0.0), at_level.any(0), inside.any(0))
+
+
+class Closest(NamedTuple):
+    """The contact with the least gap near the closest approach of two paths."""
+
+    gap: Array  # (*batch) [m]
+    rate: Array  # (*batch) [m/s]
+    curvature: Array  # (*batch) [m/s^2]: a difference of its rates, which holds what corners and turning faces add
+
+    def step(self) -> Array:
+        """(*batch) [s] towards the closest approach."""
+        return -jnp.where(self.curvature > 0, safe_divide(self.rate, self.curvature), 0.0)
+
+    def level(self, width: Array) -> Array:
+        """Level of a smooth impact, (*batch) [m], for a width (*batch) [m]."""
+        turns_back = self.curvature > 0
+        square = safe_divide(self.rate * self.rate, jnp.where(turns_back, self.curvature, 0.0))
+        return jnp.where(turns_back, softplus(self.gap - 0.5 * square, width), 0.0)
+
+
+def closest(a: Side, b: Side, t: Array, eta: Array, live: Array) -> Closest:
+    """At t (*batch) [s], with the rates at t - eta and t + eta."""
+    gaps = jax.vmap(lambda t: gaps_at(a, b, t, live)[:2])(jnp.stack([t - eta, t, t + eta]))
+    chosen = deepest(gaps[0][1])
+    before, rate, after = (chosen[None] * gaps[1]).sum(1)
+    return Closest((chosen * gaps[0][1]).sum(0), rate, safe_divide(after - before, 2.0 * eta))
+
+
+def deepest(gap: Array) -> Array:
+    """1 for the least of the gaps (K, *batch), else 0."""
+    return jax.nn.one_hot(jnp.argmin(gap, 0), len(gap), axis=0, dtype=gap.dtype)
+
+
+def _time_to(height: Array, v: Array, acc: Array) -> Array:
+    """Time until height + v t + acc t^2 / 2 next falls through zero; negative if inside and closing; inf: never."""
+    D = v * v - 2.0 * acc * height
+    root = safe_sqrt(D)
+    closing = jnp.where((D < 0) & (height > 0), jnp.inf, safe_divide(2.0 * height, root - v))
+    returning = jnp.where(acc < 0, safe_divide(v + root, -acc), jnp.inf)
+    sunk = (height < 0) & (acc < 0) & (D < 0)
+    return jnp.where(sunk, 0.0, jnp.where(v < 0, closing, returning))
+
+
+def _least(times: Array) -> Array:
+    """Of the contacts (K, *batch). Written out only where they are few: the program is not to grow with a grid."""
+    return fold(jnp.minimum, times, 0) if len(times) <= MANY else times.min(0)
+
+
+def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
+    """Bounds within the step on what spin and acceleration add to the speed of a point, and on its third derivative.
+
+    (*batch) [m/s], [m/s^3]. Without a torque a rigid body has no greater angular acceleration than w^2, which bounds
+    the third derivative of an arm r by 6 w^3 r.
+    """
+    f = side.flight
+    if f is None:
+        return jnp.zeros_like(span), jnp.zeros_like(span)
+    so, reach = rotations(f.dim), reach_of(side)
+    w, a = norm(so.unspin(f.inverse_inertia, f.q, f.L)), norm(f.a)
+    jerk = 8.0 * w * w * w * reach
+    if f.jerk is not None:
+        a, jerk = a + span * norm(f.jerk), jerk + norm(f.jerk)
+    if f.tau is not None:
+        jerk = jerk + 4.0 * w * reach * norm(so.unspin(f.inverse_inertia, f.q, f.tau))
+    return 1.1 * w * reach + a * span, jerk
