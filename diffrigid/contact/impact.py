@@ -67,7 +67,10 @@ def find_impact(
     closing = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
     if len(rests) == len(gap) == 1:  # what rests would always meet next when it falls, and hide what else is met
         closing = closing & ~rests
-    share = closing.astype(s0.dtype) / jnp.maximum(closing.sum(0), 1)[None].astype(s0.dtype)
+    # What rested has fallen below its level since, and has no part in when the others come to theirs.
+    there = closing & (gap >= (lax.stop_gradient(level) - slack)[None])
+    struck = jnp.where(there.any(0)[None], there, closing).astype(s0.dtype)
+    share = struck / jnp.maximum(struck.sum(0), 1.0)[None]
     s = implicit_root(s0, (share * moved.gap).sum(0) - level, (share * speed).sum(0))
     # What is already inside where the paths begin is struck there, whatever its gap.
     at_once = jnp.any(closing & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)

@@ -37,11 +37,13 @@ from diffrigid.linear import solve_regular
 from diffrigid.numerics import FOUND, dot, norm, safe_divide
 from diffrigid.pytree import array, pytree, replace, static
 
-ROUNDS = 60  # at most, of Newton's method
+ROUNDS = 90  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
 ROUGH = 1e-2  # with this relative error, and then with as little as it can
 PILE = 4  # bodies; with fewer it is enough to go back to the best, and the other method need not be compiled
-SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little
+SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little: twice as many every
+DOUBLES = 5  # of Newton's rounds, where it does not get on, up to
+SMOOTHEST = 384
 LITTLE = 0.9  # of the error before: a step that leaves more gained little
 PATIENCE = 3  # rounds that do not halve the error: then a small one is rounding, and else the best is smoothed
 # The power of the spacing of numbers that e is. A step leaves an error of relative size e / least eigenvalue of W / k,
@@ -174,7 +176,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: 
     """
 
     def solved(guess):
-        P = _smoothed(guess, cone, v_rel, arms, mobility)
+        P = _smoothed(guess, SMOOTHING, cone, v_rel, arms, mobility)
         z, r = _missing(P, cone, v_rel, arms, mobility)
         error = _speed(cone, r)
         start = Search(0, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
@@ -187,9 +189,8 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: 
 def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     """A Newton step, from which P is brought back into the cones.
 
-    Where that gains little, half of the step is tried too, and the better of both made smoother by some rounds in which
-    each contact takes a share of the masses of its bodies (Tonge et al. 2012); where that does not help, it is the best
-    P that is made smoother. Without all that, P may go round in circles.
+    Where that gains little, half of the step is tried too, and the better of both made smoother; where that does not
+    help, it is the best P that is made smoother, and more so the longer it takes. Else P may go round in circles.
     """
     cone, v_rel, arms, mobility = given
     slope = _slope(cone, now.z)
@@ -198,11 +199,15 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     P, since = allowed(cone, now.P + dP), now.since
     z, r = _missing(P, *given)
 
+    lost = _lacks(cone, now) & (now.since >= PATIENCE)
+    rounds = jnp.where(any_world(lost), SMOOTHING << (now.count // DOUBLES), SMOOTHING)
+
     def smoothed(P, _, r):
         half = allowed(cone, now.P + 0.5 * dP)
         nearer = _speed(cone, _missing(half, *given)[1]) < _speed(cone, r)
         before = jnp.where(now.since == PATIENCE, now.best, now.P)
-        P = _smoothed(jnp.where(now.since >= PATIENCE, before, jnp.where(nearer[None, None], half, P)), *given)
+        P = jnp.where(now.since >= PATIENCE, before, jnp.where(nearer[None, None], half, P))
+        P = _smoothed(P, jnp.minimum(rounds, SMOOTHEST), *given)
         return P, *_missing(P, *given)
 
     poor = _lacks(cone, now) & (_speed(cone, r) > LITTLE * now.error)
@@ -237,12 +242,23 @@ def _missing(P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility)
     return z, allowed(cone, z) - P
 
 
-def _smoothed(P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
-    def smoother(_, P):
-        z = _excess(cone, P, v_rel, arms, mobility)
-        return allowed(cone, P + (z - P) / cone.sharing[:, None])
+def _smoothed(P: Array, rounds: Any, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
+    """After rounds in which each contact takes a share of the masses of its bodies (Tonge et al. 2012).
 
-    return lax.fori_loop(0, SMOOTHING, smoother, P)
+    They go on in the direction of the round before (Nesterov 1983), unless that leads back (O'Donoghue & Candes 2015).
+    """
+
+    def smoother(_, carry):
+        P, ahead, t = carry
+        z = _excess(cone, ahead, v_rel, arms, mobility)
+        new = allowed(cone, ahead + (z - ahead) / cone.sharing[:, None])
+        step = new - P
+        back = (cone.scale * ((ahead - new) * step).sum(1)).sum(0) > 0
+        following = 0.5 * (1.0 + jnp.sqrt(1.0 + 4.0 * t * t))
+        onward = jnp.where(back, 0.0, (t - 1.0) / following)
+        return new, new + onward[None, None] * step, jnp.where(back, 1.0, following)
+
+    return lax.fori_loop(0, rounds, smoother, (P, P, jnp.ones_like(P[0, 0])))[0]
 
 
 def _speed(cone: Cone, P: Array) -> Array:
