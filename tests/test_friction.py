@@ -276,7 +276,7 @@ def rocking_in_theory(half, mu, e, angle, w):
 
 
 @pytest.mark.parametrize(
-    "half, mu, e, atol", [((0.2, 0.3), 100.0, 0.0, (1e-9, 3e-4, 1e-5)), ((0.3, 0.2), 0.0, 0.6, (1e-4, 8e-3, 1e-4))]
+    "half, mu, e, atol", [((0.2, 0.3), 100.0, 0.0, (1e-9, 1e-4, 2e-6)), ((0.3, 0.2), 0.0, 0.6, (3e-5, 4.5e-3, 7e-5))]
 )
 def test_a_box_rocks_from_corner_to_corner(half, mu, e, atol):
     """What rests is held until another corner strikes: a box that falls until then loses 7e-3 J and has other slopes."""
@@ -321,7 +321,7 @@ def over_a_dome_in_theory(shape, mu, start, radius):
     return jnp.stack([angle, w * (0.1 + radius)])
 
 
-@pytest.mark.parametrize("shape, rolling", [(dr.Disc, 2e-5), (dr.Sphere, 4e-5)])
+@pytest.mark.parametrize("shape, rolling", [pytest.param(dr.Disc, 2e-5, marks=pytest.mark.slow), (dr.Sphere, 4e-5)])
 def test_what_is_round_slides_and_rolls_over_a_dome(shape, rolling):
     """The normal turns: of second order in the step, and so are the slopes."""
     motion, theory = partial(over_a_dome, shape), partial(over_a_dome_in_theory, shape)

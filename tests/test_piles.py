@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 import diffrigid as dr
+from diffrigid.contact import together
+from diffrigid.contact.cone import Cone, split
+from diffrigid.contact.mobility import Arms, Mobility, moved
 
 G, RATE = 9.81, 60
 STANDS = 1e-9  # [m] drift in two seconds; the solver works to rounding
@@ -116,3 +119,41 @@ def test_what_begins_deep_inside_each_other_parts_gently(dtype):
         energy, slope = with_slopes(heap())
         assert energy.max() < 1.5 * energy[0]
         assert jnp.isfinite(slope).all()
+
+
+def test_a_box_on_a_box_is_solved_at_any_speed():
+    """Contacts that repeat each other, some stick and some slide: none closes, pulls, or rubs more than it may."""
+    random, worlds = np.random.default_rng(0), 400
+    corners = np.array([(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+    low, high = (
+        np.column_stack([corners * size, np.full(4, h)]) for size, h in (((0.2, 0.15), -0.1), ((0.15, 0.12), 0.1))
+    )
+    edge = np.array([(-0.15, 0.0, 0.1), (0.02, 0.12, 0.1)])
+    arm_a = np.concatenate([low, high, edge])[..., None] + 0.004 * random.normal(size=(10, 3, worlds))
+    tilt = 0.03 * random.normal(size=(10, 3, worlds)) * (np.arange(10) > 3)[:, None, None]
+    normal = np.where(np.arange(10) < 4, 1.0, -1.0)[:, None, None] * np.array([0.0, 0.0, 1.0])[:, None] + tilt
+    normal = jnp.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    arms = Arms(
+        arm_a=jnp.asarray(arm_a), arm_b=jnp.asarray(arm_a - np.array([0.03, 0.02, 0.3])[:, None]),
+        a=(0,) * 10, b=(2,) * 4 + (1,) * 6,
+    )  # fmt: skip
+    inverse = jnp.broadcast_to(jnp.diag(jnp.array([50.0, 58.0, 92.0]))[None, ..., None], (2, 3, 3, worlds))
+    mobility = Mobility(inverse_mass=jnp.ones((2, worlds)), inverse_inertia=inverse)
+    sizes, none = np.array([0.6, 0.6, 0.6, 3.0, 3.0, 3.0])[:, None], jnp.zeros((10, worlds))
+    v, w = jnp.split(jnp.asarray(sizes * random.normal(size=(2, 6, worlds))), 2, axis=1)
+    point_a, point_b = (
+        v[i][None] + jnp.cross(w[i][None], arm, axis=1) for i, arm in ((0, arms.arm_a), (1, arms.arm_b))
+    )
+    v_rel = point_a - jnp.where(jnp.arange(10)[:, None, None] < 4, 0.0, point_b)
+    mu = jnp.asarray(random.uniform(0.0, 1.2, worlds))[None] + none
+    cone = Cone(
+        on=1.0 + none, rest_speed=jnp.full(worlds, 1e-3), sharing=10.0 + none, scale=20.0 + none, normal=normal,
+        target=none, mu=mu,
+    )  # fmt: skip
+    solve = jax.jit(together.solve_together)
+    P = solve(jnp.asarray(True), cone, v_rel, 1e-4 * normal, arms, mobility)
+    (y_n, y_t), (P_n, P_t) = (split(normal, x) for x in (v_rel + moved(P, arms, mobility), P))
+    rubs, slips = (jnp.linalg.norm(x, axis=1) for x in (P_t, y_t))
+    wrong = jnp.stack([-y_n, jnp.abs(P_n * y_n), -P_n, rubs - mu * P_n, slips * (mu * P_n - rubs), (P_t * y_t).sum(1)])
+    assert (wrong.max((0, 1)) < 1e-6).mean() > 0.98
+    assert wrong.max() < 1e-3  # [m/s], [N s], and their products
