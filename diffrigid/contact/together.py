@@ -41,9 +41,9 @@ ROUNDS = 90  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
 ROUGH = 1e-2  # with this relative error, and then with as little as it can
 PILE = 4  # bodies; with fewer it is enough to go back to the best, and the other method need not be compiled
-SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little: twice as many every
-DOUBLES = 5  # of Newton's rounds, where it does not get on, up to
-SMOOTHEST = 384
+SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little
+DOUBLES = 5  # Newton's rounds after which these are twice as many, where it does not get on
+SMOOTHEST = 384  # of them at most
 LITTLE = 0.9  # of the error before: a step that leaves more gained little
 PATIENCE = 3  # rounds that do not halve the error: then a small one is rounding, and else the best is smoothed
 # The power of the spacing of numbers that e is. A step leaves an error of relative size e / least eigenvalue of W / k,
