@@ -196,7 +196,7 @@ def at_home(dim, friction, e=0.8):
     return compiled_yard(dim)(so.exp(jnp.zeros(so.A)), jnp.zeros(dim), jnp.asarray(friction), jnp.asarray(e))
 
 
-@pytest.mark.parametrize("friction, e", [(0.0, 0.8), (0.3, 0.8), (0.5, 1.0)])
+@pytest.mark.parametrize("friction, e", [pytest.param(0.0, 0.8, marks=pytest.mark.slow), (0.3, 0.8), (0.5, 1.0)])
 def test_planar_scene_in_space_is_the_scene_in_the_plane(friction, e):
     """At e = 1 friction would make energy, at one corner in the plane, at the two of an edge in space."""
     flat, deep = at_home(2, friction, e)[0], at_home(3, friction, e)[0]

@@ -17,7 +17,7 @@ class Cone:
     on: Array = array("C")  # 1 where the contact takes part, else 0
     rest_speed: Array = array()  # (*batch) [m/s] slow, for the world: its impulses are found to a small part of it
     sharing: Array = array("C")  # contacts on the body that has more of them
-    scale: Array = array("C")  # k [1/kg] of the order of the contact's mobility; the solution does not depend on it
+    scale: Array = array("C")  # k [1/kg] of the order of the contact's mobility; of many solutions it chooses one
     normal: Array = array("C", "D")
     target: Array = array("C")  # [m/s]
     mu: Array = array("C")

@@ -104,7 +104,7 @@ def barely(strikes: Strikes, rest_speed: Array) -> Array:
 
 def _scale(strikes: Strikes) -> Array:
     """Size of the effective matrices, (C, *batch) [1/kg]."""
-    return lax.stop_gradient(safe_sqrt((strikes.K**2).sum((1, 2))))
+    return safe_sqrt((strikes.K**2).sum((1, 2)))
 
 
 def are_alone(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> bool:

@@ -40,8 +40,9 @@ from diffrigid.shapes import HalfSpace, HeightField
 
 CROSSED = 3  # advances for each node along a side of a grid: the length of its diagonal in half cells
 ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
-POLISH = 6  # steps along the local parabola of the gap; error squared by each
-TURN = 3  # looks for one step towards the closest approach, of which there are no more than POLISH
+POLISH = 12  # steps along the local parabola of the gap at most; near the impact the error is squared by each
+TURN = 3  # looks for one step towards the closest approach
+TURNS = 6  # of these steps at most
 ETA = 0.25  # [-] of the step: how far before and after it the rates are taken
 ADVANCING, NEARING, POLISHING, DONE = range(4)
 
@@ -101,7 +102,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
             step = closest(task.a, task.b, t, ETA * task.span, live).step()
             return jnp.clip(t + step, near - task.span, near + task.span)
 
-        t = lax.fori_loop(0, POLISH, nearer, near)
+        t = lax.fori_loop(0, TURNS, nearer, near)
         return t, closest(task.a, task.b, t, ETA * task.span, live).level(task.width)  # type: ignore[arg-type]
 
     nearest, level = if_smooth(task.width, approach, lambda near: (near, jnp.zeros_like(near)), near)
@@ -219,7 +220,7 @@ def _nearer(task: Task, now: Search, gaps: Gaps) -> Search:
     c = Turn(t=t, chosen=chosen, gap=gap, rate=jnp.where(first, rate, c.rate), before=before)
     seen = Closest(c.gap, c.rate, safe_divide(rate - c.before, 2.0 * eta))
     onward = jnp.clip(t + seen.step(), now.near - task.span, now.near + task.span)
-    ends = last & ((jnp.abs(onward - t) <= task.slack * task.span) | (now.tries >= TURN * POLISH))
+    ends = last & ((jnp.abs(onward - t) <= task.slack * task.span) | (now.tries >= TURN * TURNS))
     c = c._replace(t=jnp.where(last & ~ends, onward, t))
     s = jnp.where(ends, now.near, jnp.where(last, c.t, jnp.where(first, t - eta, t + eta)))
     level = jnp.where(ends, seen.level(task.width), now.level)  # type: ignore[arg-type]

@@ -106,17 +106,16 @@ def lost_to_stops(
     """
     speed, at_end_speed = (jax.vmap(norm)(r) for r in (slip, at_end))
     slipping = speed > least_slip(T.dtype)
-    # Against the slip: what contacts of the same two wholes do against each other stops nothing.
-    own = -jax.vmap(dot)(friction, at_end / jnp.where(at_end_speed > 0, at_end_speed, 1.0)[:, None])
+    # What acts against the slip of two wholes, by its power, which is one where how contacts share friction is not.
+    power, bound = (in_all(strikes, slipping, each) for each in (-jax.vmap(dot)(friction, at_end), bounds))
+    most_power = in_all(strikes, slipping, bounds * at_end_speed)
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])
-    total, bound = in_all(strikes, slipping, own), in_all(strikes, slipping, bounds)
-    size, sense = jnp.minimum(jnp.abs(total), most_to_stop), jnp.where(total < 0, -1.0, 1.0).astype(own.dtype)
-    # Shared by those that act in the sense of all: a share of what nearly cancels would be anything.
-    along_all = jnp.maximum(sense * own, 0.0)
-    own = sense * along_all * safe_divide(size, in_all(strikes, slipping, along_all))
+    least = float(jnp.finfo(T.dtype).tiny) ** 0.5  # the derivative of a quotient divides by the square of this
+    total = bound * safe_divide(power, jnp.where(most_power > least, most_power, 0.0))
+    size, sense = jnp.minimum(jnp.abs(total), most_to_stop), jnp.where(total < 0, -1.0, 1.0).astype(total.dtype)
+    own = sense * size * safe_divide(bounds, jnp.where(bound > least, bound, 0.0))
     whole = at_end_speed * bound + size * (speed - along)
     stops = strikes.active & slipping & (size < STICKS * bound) & (T > 0)
-    least = float(jnp.finfo(T.dtype).tiny) ** 0.5  # the derivative of a quotient divides by the square of this
     stops = stops & (at_end_speed > least) & (whole > least)
     share = safe_divide(speed * size, jnp.where(stops, whole, 0.0))  # tau / T
     per_speed = safe_divide(own, jnp.where(stops, at_end_speed, 0.0))

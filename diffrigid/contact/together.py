@@ -5,21 +5,18 @@ what Coulomb allows of an impulse,
 
     P = allowed(z),   z = P - (y - target n) / k,   y = v_rel + W P,   W = J G J^T
 
-says at once that contacts do not pull, do not close, and slip only against all of their friction. It is solved by
-Newton's method with the derivative D of `allowed`. Sticking makes (1 - D) + D W / k singular where contacts repeat
-each other, as four corners on a floor do, so the method of multipliers is mixed in: D is taken (1 - e) D, with a
-small e. Then B = 1 - (1 - e) D has an inverse contact by contact, and with u = G J^T dP, the change of the twists of
-the bodies,
+says at once that contacts do not pull, do not close, and slip only against all of their friction. Where contacts repeat
+each other, as four corners on a floor do, many P do. One of them is chosen by a small compliance e, which asks for the
+least impulses (those nearest to a guess):
 
-    (1 + G J^T B^-1 D J / k) u = G J^T B^-1 r,    dP = B^-1 (r - D J u / k)
+    z = P - e (P - rest) - (y - target n) / k,   rest: first the guess, then the P that this leads to
 
-so what is solved is as large as the bodies are many, and not the contacts.
+The second P is as if nothing yielded, to the order of e^2. It is solved by Newton's method (`slope.py`), for both.
 Source: Alart & Curnier, Computer Methods in Applied Mechanics and Engineering 92 (1991) 353, for the equation;
-Bertsekas, Constrained Optimization and Lagrange Multiplier Methods, 1982, for e.
+Rockafellar, SIAM J. Control and Optimization 14 (1976) 877, for `rest`.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -28,14 +25,13 @@ import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.branches import any_world
-from diffrigid.contact.cone import Cone, allowed, loaded, put, split, turning
-from diffrigid.contact.mobility import Arms, Mobility, at_contacts, bodies_matrix, moved, twists
+from diffrigid.branches import any_world, choose
+from diffrigid.contact.cone import Cone, allowed, split
+from diffrigid.contact.mobility import Arms, Mobility, bodies_matrix, moved
 from diffrigid.contact.multipliers import solve_roughly
+from diffrigid.contact.slope import answer, newton_step, slope_at, sloped
 from diffrigid.gathers import fold
-from diffrigid.linear import solve_regular
-from diffrigid.numerics import FOUND, dot, norm, safe_divide
-from diffrigid.pytree import array, pytree, replace, static
+from diffrigid.numerics import FOUND, safe_divide
 
 ROUNDS = 90  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
@@ -46,126 +42,43 @@ DOUBLES = 5  # Newton's rounds after which these are twice as many, where it doe
 SMOOTHEST = 384  # of them at most
 LITTLE = 0.9  # of the error before: a step that leaves more gained little
 PATIENCE = 3  # rounds that do not halve the error: then a small one is rounding, and else the best is smoothed
-# The power of the spacing of numbers that e is. A step leaves an error of relative size e / least eigenvalue of W / k,
-# which for a tower is 1e-4 and less, and one of rounding / e.
-SMALLNESS = 0.55
-REFINEMENTS = 8  # of the linear system of the derivative
-
-
-@pytree
-class Slope:
-    """D, the derivative of `allowed` at z, contact by contact, as numbers and directions."""
-
-    on: Array = array("C")  # 1 where the contact pushes, else 0
-    slides: Array = array("C")  # 1 where it does at its bound of friction
-    bends: Array = array("C")  # [-] how far the direction of sliding follows z; 1 where it sticks
-    normal: Array = array("C", "D")
-    along: Array = array("C", "D")  # of the sliding
-    mu: Array = array("C")
-    free: Any = array("K", default=None)  # rows that turn: 1 where along the normal they are within their bounds
-    spin: Any = array("K", default=None)  # [m] else how that follows the load
-    small: float = static(default=0.0)  # e
+COMPLIANCE = 0.5  # the power of the spacing of numbers that e is
+REFINEMENTS = 4  # of the linear system of the derivative
 
 
 def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
     """z, (C, D, *batch) [N s]."""
     y = v_rel + moved(P, arms, mobility)
-    return P - (y - cone.target[:, None] * cone.normal) / cone.scale[:, None]
+    return (1.0 - _compliance(P)) * P - (y - cone.target[:, None] * cone.normal) / cone.scale[:, None]
 
 
-def _slope(cone: Cone, z: Array) -> Slope:
-    """D at z."""
-    z_n, z_t = split(cone.normal, z)
-    size, bound = jax.vmap(norm)(z_t), cone.mu * jnp.maximum(z_n, 0.0)
-    if cone.spin is not None:
-        bound = loaded(cone, jnp.maximum(z_n, 0.0), z_n, bound)[1]
-    follows = z_n > 0 if cone.most is None else jnp.where(jnp.isinf(cone.most), z_n > 0, jnp.abs(z_n) < cone.most)
-    on, slides = jnp.where(follows, cone.on, 0.0), (size >= bound).astype(z.dtype)
-    bends, along = jnp.where(size < bound, 1.0, safe_divide(bound, size)), z_t / jnp.where(size > 0, size, 1.0)[:, None]
-    small = float(jnp.finfo(z.dtype).eps) ** SMALLNESS
-    slope = Slope(on=on, slides=slides, bends=bends, normal=cone.normal, along=along, mu=cone.mu, small=small)
-    if cone.spin is None:
-        return slope
-    load, about = jnp.maximum(z_n[: len(cone.spin)], 0.0), turning(cone.spin, z_n)
-    free = (jnp.abs(about) < cone.spin * load).astype(z.dtype)
-    on = put(cone.spin, on, turning(cone.spin, cone.on))
-    return replace(slope, on=on, free=free, spin=(1.0 - free) * cone.spin * jnp.sign(about))
+def _compliance(P: Array) -> float:
+    """e"""
+    return float(jnp.finfo(P.dtype).eps) ** COMPLIANCE
 
 
-def _sloped(slope: Slope, r: Array) -> Array:
-    """D r, (C, D, *batch)."""
-    r_n, r_t = split(slope.normal, r)
-    load = r_n
-    if slope.spin is not None:
-        load = put(slope.spin, r_n, (slope.on * r_n)[: len(slope.spin)])
-        r_n = put(slope.spin, r_n, slope.free * turning(slope.spin, r_n) + slope.spin * turning(slope.spin, load))
-    along = slope.slides * (slope.mu * load - slope.bends * jax.vmap(dot)(slope.along, r_t))
-    return slope.on[:, None] * (r_n[:, None] * slope.normal + slope.bends[:, None] * r_t + along[:, None] * slope.along)
-
-
-def _unsloped(slope: Slope, r: Array) -> tuple[Array, Array]:
-    """B^-1 r and B^-1 D r, by components: normal, along the sliding, and across both."""
-    r_n, r_t = split(slope.normal, r)
-    r_along = slope.slides * jax.vmap(dot)(slope.along, r_t)
-    r_across = r_t - r_along[:, None] * slope.along
-    e, on = slope.small, slope.on
-    kept = 1.0 - on * (1.0 - e)
-    rest = 1.0 - on * (1.0 - e) * slope.bends  # e where it sticks
-    if slope.spin is not None:
-        kept = put(slope.spin, kept, 1.0 - turning(slope.spin, on) * slope.free * (1.0 - e))
-        return _unsloped_rows(slope, r_n / kept, r_along, r_across, rest)
-    drag = slope.slides * slope.mu * r_n / kept * on
-    B_r = (r_n / kept)[:, None] * slope.normal + r_across / rest[:, None]
-    BD_r = (on * r_n / kept)[:, None] * slope.normal + (on * slope.bends / rest)[:, None] * r_across
-    return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
-
-
-def _unsloped_rows(slope: Slope, x_n: Array, r_along: Array, r_across: Array, rest: Array):
-    """The same where rows turn: what loads them is the first of the results, at their contacts.
-
-    Args:
-        x_n: normal components of B^-1 r but for what rows get from their load.
-    """
-    e, on, count = slope.small, slope.on, len(slope.spin)
-    load = put(slope.spin, x_n, (on * x_n)[:count])
-    more = put(slope.spin, jnp.zeros_like(x_n), slope.spin * turning(slope.spin, on * load))
-    own = put(slope.spin, on, turning(slope.spin, on) * slope.free) * x_n
-    drag = on * slope.slides * slope.mu * load
-    B_r = (x_n + (1.0 - e) * more)[:, None] * slope.normal + r_across / rest[:, None]
-    BD_r = (own + more)[:, None] * slope.normal + (on * slope.bends / rest)[:, None] * r_across
-    return B_r + (r_along + (1.0 - e) * drag)[:, None] * slope.along, BD_r + drag[:, None] * slope.along
-
-
-def _answer(slope: Slope, cone: Cone) -> Callable[[Array], Array]:
-    """B^-1 D / k: impulses for relative velocities, (C, D, *batch)."""
-    return lambda y: _unsloped(slope, y / cone.scale[:, None])[1]
-
-
-def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
-    """B^-1 D J / k of the twists (C, *batch) of all bodies: impulses, (C, D, *batch)."""
-    return _answer(slope, cone)(at_contacts(arms, twist))
-
-
-def _newton_step(r: Array, matrix: Array, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
-    """dP of (B + D W / k) dP = r, (C, D, *batch); the matrix is that of the twists."""
-    direct = _unsloped(slope, r)[0]
-    return direct - _pushed_back(slope, cone, arms, solve_regular(matrix, twists(direct, arms, mobility)))
+def _yielded(cone: Cone, P: Array) -> Array:
+    """Velocities (C, D, *batch) [m/s] to which compliance yields."""
+    return _compliance(P) * cone.scale[:, None] * P
 
 
 class Search(NamedTuple):
     """How far Newton's method has come in every world of a batch."""
 
     count: Any  # int: rounds
+    rigid: Array  # (*batch) bool: the compliant solution is found, and nothing yields any more
+    rest: Array  # (C, D, *batch) [N s] impulses at which nothing is yielded to: the guess, and then that solution
+    tried: Array  # (*batch) bool: a step from here left the cones of contacts, so that another is tried
+    at: Array  # (C, D, *batch) [N s] where `allowed` is linearised: z, or where that step left a cone
     P: Array  # (C, D, *batch) [N s]
     z: Array  # its `_excess`
-    r: Array  # what is missing: allowed(z) - P
+    r: Array  # what P lacks: allowed(z) - P, linearised at `at`
     best: Array  # of all P
     error: Array  # (*batch) [m/s] of the best
     since: Array  # (*batch) int: rounds since the error was halved
     mark: Array  # (*batch) [m/s] error then
 
 
-@jax.custom_jvp
 def solve_together(shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: Arms, mobility: Mobility) -> Array:
     """Impulses of all contacts that take part, (C, D, *batch) [N s]; zero for the others.
 
@@ -174,33 +87,54 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: 
         v_rel: (C, D, *batch) [m/s] before the impulses.
         guess: (C, D, *batch) [N s] impulses to begin with.
     """
+    return _solutions(shared, cone, v_rel, guess, arms, mobility)[0]
+
+
+@jax.custom_jvp
+def _solutions(
+    shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: Arms, mobility: Mobility
+) -> tuple[Array, Array]:
+    """Of `solve_together`, and of what is compliant."""
 
     def solved(guess):
-        P = _smoothed(guess, SMOOTHING, cone, v_rel, arms, mobility)
-        z, r = _missing(P, cone, v_rel, arms, mobility)
+        at_guess = cone, v_rel - _yielded(cone, guess), arms, mobility
+        P = _smoothed(guess, SMOOTHING, *at_guess)
+        z, r = _missing(P, *at_guess)
         error = _speed(cone, r)
-        start = Search(0, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
-        again = functools.partial(_again, given=(cone, v_rel, arms, mobility))
-        return lax.while_loop(lambda now: (now.count < ROUNDS) & any_world(_lacks(cone, now)), again, start).best
+        no = error < 0
+        start = Search(0, no, guess, no, z, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
 
-    return lax.cond(shared, solved, jnp.zeros_like, guess)
+        def again(now):
+            now = _made_rigid(cone, now)
+            return _again(now, (cone, v_rel - _yielded(cone, now.rest), arms, mobility))
+
+        def goes_on(now):
+            return (now.count < ROUNDS) & any_world(_lacks(cone, now) | _yields(cone, now))
+
+        end = lax.while_loop(goes_on, again, start)
+        return end.best, jnp.where(end.rigid[None, None], end.rest, end.best)
+
+    return lax.cond(shared, solved, lambda guess: (jnp.zeros_like(guess),) * 2, guess)
 
 
 def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     """A Newton step, from which P is brought back into the cones.
 
-    Where that gains little, half of the step is tried too, and the better of both made smoother; where that does not
-    help, it is the best P that is made smoother, and more so the longer it takes. Else P may go round in circles.
+    Where that gains little because contacts leave their cones, the step is taken again with these linearised where they
+    came to. Else half of the step is tried too, and the better of both made smoother; where that does not help, it is
+    the best P that is made smoother, and more so the longer it takes. Else P may go round in circles.
     """
     cone, v_rel, arms, mobility = given
-    slope = _slope(cone, now.z)
-    matrix = bodies_matrix(_answer(slope, cone), arms, mobility)
-    dP = _newton_step(now.r, matrix, slope, cone, arms, mobility)
-    P, since = allowed(cone, now.P + dP), now.since
+    slope = slope_at(cone, now.at, _compliance(now.P))
+    matrix = bodies_matrix(answer(slope, cone), arms, mobility)
+    dP = newton_step(now.r, matrix, slope, cone, arms, mobility)
+    to, since = now.P + dP, now.since
+    P = allowed(cone, to)
+    leaves = (P != to).any(1) & ((slope.slides == 0) | (split(cone.normal, to)[0] < 0))
     z, r = _missing(P, *given)
 
-    lost = _lacks(cone, now) & (now.since >= PATIENCE)
-    rounds = jnp.where(any_world(lost), SMOOTHING << (now.count // DOUBLES), SMOOTHING)
+    stays = _lacks(cone, now) & (now.since >= PATIENCE)
+    rounds = jnp.where(any_world(stays), SMOOTHING << (now.count // DOUBLES), SMOOTHING)
 
     def smoothed(P, _, r):
         half = allowed(cone, now.P + 0.5 * dP)
@@ -211,21 +145,55 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
         return P, *_missing(P, *given)
 
     poor = _lacks(cone, now) & (_speed(cone, r) > LITTLE * now.error)
-    P, z, r = lax.cond(any_world(poor), smoothed, lambda *kept: kept, P, z, r)
+    again = poor & leaves.any(0) & ~now.tried
+    strays = (now.error <= _compliance(P) * _speed(cone, now.best)) & (now.since < PATIENCE)
+    P, z, r = lax.cond(any_world(poor & ~again & ~strays), smoothed, lambda *kept: kept, P, z, r)
+    P, z, r = (jnp.where(again[None, None], old, new) for old, new in ((now.P, P), (now.z, z), (now.r, r)))
     if mobility.inverse_mass.shape[0] >= PILE:
-        circles = (now.count > 0) & (now.count % CIRCLES == 0) & any_world(_circles(cone, now))
+        lost = (now.count > 0) & (now.count % CIRCLES == 0) & _circles(cone, now) & ~again
         P, z, r, since = lax.cond(
-            circles, functools.partial(_elsewhere, now, given), lambda *kept: kept, P, z, r, since
+            any_world(lost), functools.partial(_elsewhere, now, given, lost), lambda *kept: kept, P, z, r, since
         )
     size = _speed(cone, r)
     best, halved = jnp.where((size < now.error)[None, None], P, now.best), size < 0.5 * now.mark
-    since, mark = jnp.where(halved, 0, since + 1), jnp.where(halved, size, now.mark)
-    return Search(now.count + 1, P, z, r, best, jnp.minimum(size, now.error), since, mark)
+    since = jnp.where(halved, 0, jnp.where(again, since, since + 1))
+    mark = jnp.where(halved, size, now.mark)
+
+    def beyond(z, r):
+        left = (again[None] & leaves)[:, None]
+        along = allowed(cone, to) + sloped(slope_at(cone, to, _compliance(P)), z - to) - P
+        return jnp.where(left, to, z), jnp.where(left, along, r)
+
+    at, r = lax.cond(any_world(again), beyond, lambda z, r: (z, r), z, r)
+    return Search(
+        now.count + 1, now.rigid, now.rest, again, at, P, z, r, best, jnp.minimum(size, now.error), since, mark
+    )  # fmt: skip
 
 
-def _elsewhere(now: Search, given: tuple[Cone, Array, Arms, Mobility], P: Array, z: Array, r: Array, since: Array):
-    """Another start, by the method of multipliers, in worlds that go round in circles."""
-    cone, lost = given[0], _circles(given[0], now)
+def _yields(cone: Cone, now: Search) -> Array:
+    """Whether the compliant solution is found, and yields to more than rounding, (*batch) bool."""
+    found = ~now.rigid & ~_lacks(cone, now) & (_speed(cone, now.r) <= now.error)
+    yielded = _compliance(now.P) * _speed(cone, now.P - now.rest)
+    return found & (yielded > 16.0 * jnp.finfo(now.P.dtype).eps * _speed(cone, now.P) + _least(cone))
+
+
+def _made_rigid(cone: Cone, now: Search) -> Search:
+    """Where what yields is found, nothing yields any more: the solution then is next to it."""
+    found = _yields(cone, now)
+    z = now.z + _compliance(now.P) * (now.P - now.rest)
+    r = allowed(cone, z) - now.P
+    error = _speed(cone, r)
+    rigid = now._replace(
+        rigid=found, rest=now.P, at=z, z=z, r=r, error=error, since=jnp.zeros_like(now.since), mark=error
+    )
+    return choose(found, rigid, now)
+
+
+def _elsewhere(
+    now: Search, given: tuple[Cone, Array, Arms, Mobility], lost: Array, P: Array, z: Array, r: Array, since: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Another start, by the method of multipliers, in worlds that are `lost`."""
+    cone = given[0]
 
     def wrong(P):
         return _speed(cone, _missing(P, *given)[1])
@@ -276,7 +244,7 @@ def _lacks(cone: Cone, now: Search) -> Array:
     rounding = jnp.finfo(now.P.dtype).eps
     small = jnp.where(now.since < 5 * PATIENCE, rounding**0.6, jnp.inf)
     small = jnp.where(now.since < 2 * PATIENCE, rounding**0.75, small)
-    small = jnp.where(now.since < PATIENCE, 16.0 * rounding, small)
+    small = jnp.where(now.since < PATIENCE, rounding * jnp.where(now.rigid, 16.0, 1e3), small)
     return now.error > small * _speed(cone, now.best) + _least(cone)
 
 
@@ -285,28 +253,40 @@ def _circles(cone: Cone, now: Search) -> Array:
     return now.error > 3.0 * jnp.finfo(now.P.dtype).eps ** 0.5 * _speed(cone, now.best) + _least(cone)
 
 
-@solve_together.defjvp
-def _solve_together_jvp(primals, tangents):
-    """(1 - D + D W / k) dP = what the parameters change of `allowed(z)` at fixed P."""
-    shared, cone, v_rel, _, arms, mobility = primals
-    P = checkpoint_name(solve_together(*primals), FOUND)
+@_solutions.defjvp
+def _solutions_jvp(primals, tangents):
+    """With A = 1 - D ((1 - e) - W / k): A dP_1 = change of the compliant one, A dP = change + e D dP_1."""
+    shared, cone, v_rel, guess, arms, mobility = primals
+    P, compliant = checkpoint_name(_solutions(*primals), FOUND)
+    e = _compliance(P)
+    yielding = _excess(cone, compliant, v_rel, arms, mobility) + e * guess
+    z = _excess(cone, P, v_rel, arms, mobility) + e * compliant
+    # What creeps, or lets go, by as much as it yields does so in the limit too, where z is on the bound.
+    slope, before = slope_at(cone, z, e), slope_at(cone, yielding, e)
+    differs = (slope.on != before.on) | (slope.slides != before.slides)
+    at = jnp.where(differs[:, None], yielding, z)
+    aside = lax.stop_gradient(at - z)
 
     def projected(cone, v_rel, arms, mobility):
-        return allowed(cone, _excess(cone, P, v_rel, arms, mobility))
+        return allowed(cone, _excess(cone, P, v_rel, arms, mobility) + e * compliant + aside)
 
     of, by = ((cone, v_rel, arms, mobility) for _, cone, v_rel, _, arms, mobility in (primals, tangents))
     change = jax.jvp(projected, of, by)[1]
-    slope = lax.stop_gradient(_slope(cone, _excess(cone, P, v_rel, arms, mobility)))
+    slope = lax.stop_gradient(slope_at(cone, at, e))
     fixed = lax.stop_gradient((slope, cone, arms, mobility))
+    by_scale = (safe_divide(tangents[1].scale, cone.scale))[:, None] * lax.stop_gradient(e * (compliant - guess))
 
-    def linear(x):
-        return x - _sloped(slope, x - moved(x, arms, mobility) / cone.scale[:, None])
+    def linear(both):
+        def A(x):
+            return x - sloped(slope, (1.0 - e) * x - moved(x, arms, mobility) / cone.scale[:, None])
+
+        return jnp.stack([A(both[0]), A(both[1]) - e * sloped(slope, both[0])])
 
     def refined(system, b, transposed):
-        matrix = bodies_matrix(_answer(*fixed[:2]), *fixed[2:])
+        matrix = bodies_matrix(answer(*fixed[:2]), *fixed[2:])
 
         def step(r):
-            return _newton_step(r, matrix, *fixed)
+            return jax.vmap(lambda r: newton_step(r, matrix, *fixed))(r)
 
         approximate = (lambda r: jax.linear_transpose(step, b)(r)[0]) if transposed else step
         return lax.fori_loop(0, REFINEMENTS, lambda _, x: x + approximate(b - system(x)), jnp.zeros_like(b))
@@ -314,4 +294,6 @@ def _solve_together_jvp(primals, tangents):
     def solve(system, b, transposed=False):
         return lax.cond(shared, lambda b: refined(system, b, transposed), jnp.zeros_like, b)
 
-    return P, lax.custom_linear_solve(linear, change, solve, transpose_solve=functools.partial(solve, transposed=True))
+    both = jnp.stack([change - sloped(slope, by_scale), change])
+    dP = lax.custom_linear_solve(linear, both, solve, transpose_solve=functools.partial(solve, transposed=True))
+    return (P, compliant), (dP[1], dP[0])
