@@ -143,7 +143,7 @@ class Contact:
         if not ends(world)["a"]:
             return 0
         of_bodies = sum(leaf.size for leaf in jax.tree.leaves(state)) + 2 * len(state.x)
-        of_rows = (4 * world.dim + 8) * _rows(world)  # impulses found and known, times, gaps
+        of_rows = (5 * world.dim + 8) * _rows(world)  # impulses found, twice, and known, times, gaps
         return len(self._phases(world)) * (of_bodies + of_rows)
 
 

@@ -180,13 +180,15 @@ def _yields(cone: Cone, now: Search) -> Array:
 def _made_rigid(cone: Cone, now: Search) -> Search:
     """Where what yields is found, nothing yields any more: the solution then is next to it."""
     found = _yields(cone, now)
-    z = now.z + _compliance(now.P) * (now.P - now.rest)
-    r = allowed(cone, z) - now.P
-    error = _speed(cone, r)
-    rigid = now._replace(
-        rigid=found, rest=now.P, at=z, z=z, r=r, error=error, since=jnp.zeros_like(now.since), mark=error
-    )
-    return choose(found, rigid, now)
+
+    def rigid(now: Search) -> Search:
+        z = now.z + _compliance(now.P) * (now.P - now.rest)
+        r = allowed(cone, z) - now.P
+        error, none = _speed(cone, r), jnp.zeros_like(now.since)
+        after = now._replace(rigid=found, rest=now.P, at=z, z=z, r=r, error=error, since=none, mark=error)
+        return choose(found, after, now)
+
+    return lax.cond(any_world(found), rigid, lambda now: now, now)
 
 
 def _elsewhere(
