@@ -42,7 +42,8 @@ DOUBLES = 5  # Newton's rounds after which these are twice as many, where it doe
 SMOOTHEST = 384  # of them at most
 LITTLE = 0.9  # of the error before: a step that leaves more gained little
 PATIENCE = 3  # rounds that do not halve the error: then a small one is rounding, and else the best is smoothed
-COMPLIANCE = 0.5  # the power of the spacing of numbers that e is
+# e: in double precision what leaves e^2 below rounding, in single precision what its own inverse allows.
+COMPLIANCE, ROUNDINGS = 1.5e-8, 100.0
 REFINEMENTS = 4  # of the linear system of the derivative
 
 
@@ -54,7 +55,7 @@ def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) 
 
 def _compliance(P: Array) -> float:
     """e"""
-    return float(jnp.finfo(P.dtype).eps) ** COMPLIANCE
+    return max(COMPLIANCE, ROUNDINGS * float(jnp.finfo(P.dtype).eps))
 
 
 def _yielded(cone: Cone, P: Array) -> Array:
@@ -242,11 +243,15 @@ def _least(cone: Cone) -> Array:
 
 
 def _lacks(cone: Cone, now: Search) -> Array:
-    """Whether the best is not yet as good as rounding allows, (*batch) bool: the longer it takes, the less is asked."""
+    """Whether the best is not yet as good as rounding allows, (*batch) bool: the longer it takes, the less is asked.
+
+    Beside the compliant solution another one is soon found, or not at all.
+    """
     rounding = jnp.finfo(now.P.dtype).eps
-    small = jnp.where(now.since < 5 * PATIENCE, rounding**0.6, jnp.inf)
-    small = jnp.where(now.since < 2 * PATIENCE, rounding**0.75, small)
-    small = jnp.where(now.since < PATIENCE, rounding * jnp.where(now.rigid, 16.0, 1e3), small)
+    first = rounding * jnp.where(now.rigid, 16.0, 1e3)
+    small = jnp.where(~now.rigid & (now.since < 5 * PATIENCE), jnp.maximum(rounding**0.6, first), jnp.inf)
+    small = jnp.where(~now.rigid & (now.since < 2 * PATIENCE), jnp.maximum(rounding**0.75, first), small)
+    small = jnp.where(now.since < PATIENCE, first, small)
     return now.error > small * _speed(cone, now.best) + _least(cone)
 
 
