@@ -32,7 +32,7 @@ class Slope:
     mu: Array = array("C")
     free: Any = array("K", default=None)  # rows that turn: 1 where along the normal they are within their bounds
     spin: Any = array("K", default=None)  # [m] else how that follows the load
-    e: float = static(default=0.0)
+    e: float = static(default=0.0)  # [-] compliance
 
 
 def slope_at(cone: Cone, z: Array, e: float) -> Slope:

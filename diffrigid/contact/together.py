@@ -54,7 +54,7 @@ def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) 
 
 
 def _compliance(P: Array) -> float:
-    """e"""
+    """e [-], what a contact yields to as a share of k P."""
     return max(COMPLIANCE, ROUNDINGS * float(jnp.finfo(P.dtype).eps))
 
 
@@ -86,7 +86,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: 
     Args:
         shared: bool: there is such a contact in some world of the batch.
         v_rel: (C, D, *batch) [m/s] before the impulses.
-        guess: (C, D, *batch) [N s] impulses to begin with.
+        guess: (C, D, *batch) [N s] impulses to begin with; of many solutions the one near to it is taken.
     """
     return _solutions(shared, cone, v_rel, guess, arms, mobility)[0]
 
