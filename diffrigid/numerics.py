@@ -91,9 +91,14 @@ def _least(like: Array) -> float:
 
 @jax.jit
 def safe_sqrt(x: Array) -> Array:
-    """Square root, 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite), or next to it."""
-    positive = x >= _least(x)
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    """Square root, 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite), or next to it.
+
+    XLA computes x anew for each that needs it, and rounds it in other ways. So what stands in for an x that is not
+    positive is next to it, and not 1: else the root of a rounding, which is positive for one of two, would be 1.
+    """
+    least = _least(x)
+    positive = x >= least
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, least)), 0.0)
 
 
 def cos_sin(phi: Array) -> tuple[Array, Array]:
@@ -124,7 +129,7 @@ def cos_sin(phi: Array) -> tuple[Array, Array]:
 def half_turn(square: Array) -> tuple[Array, Array]:
     """Cosine of half the angle |phi|, with |phi|^2 = `square`, and the factor that gives phi the length of its sine."""
     small = square < 1e-8  # there the series below is exact to rounding, and sqrt has no derivative at 0
-    half = 0.5 * safe_sqrt(jnp.where(small, 1.0, square))
+    half = 0.5 * safe_sqrt(jnp.where(small, 1e-8, square))
     cosine, sine = cos_sin(half)
     return jnp.where(small, 1.0 - square / 8.0, cosine), jnp.where(small, 0.5 - square / 48.0, 0.5 * sine / half)
 
@@ -138,9 +143,8 @@ _HALF_PI = {
 
 @jax.jit
 def safe_divide(a: Array, b: Array) -> Array:
-    """a / b, and 0 with zero derivative where b == 0 (0 / 0 in both modes), or next to it."""
-    nonzero = jnp.abs(b) >= _least(b)
-    return jnp.where(nonzero, _quotient(a, jnp.where(nonzero, b, 1.0)), 0.0)
+    """a / b of a finite a, and 0 with zero derivative where b == 0 (0 / 0 in both modes), or next to it."""
+    return _quotient(a, jnp.where(jnp.abs(b) >= _least(b), b, jnp.inf))
 
 
 @jax.custom_jvp

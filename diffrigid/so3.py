@@ -111,7 +111,7 @@ def log(q: Array) -> Array:
     s, u = q[0], q[1:]
     square = dot(u, u)
     small = square < 1e-8
-    sine = safe_sqrt(jnp.where(small, 1.0, square))
+    sine = safe_sqrt(jnp.where(small, 1e-8, square))
     scale = jnp.where(small, 2.0 / jnp.maximum(s, 0.5), 2.0 * jnp.arctan2(sine, s) / sine)
     return scale[None] * u
 

@@ -90,6 +90,25 @@ def test_vmap_keeps_branches():
         assert together.count("stablehlo.while") == alone.count("stablehlo.while")
 
 
+def test_motion_is_the_same_with_derivatives():
+    """4096 slender and thick tops: a number that is near to a switch may be rounded to its other side."""
+    rng = np.random.default_rng(0)
+
+    def top(radius, half_length):
+        return dr.scene({"top": dr.Body(dr.Capsule(radius=radius, half_length=half_length), mass=2.0, x=(0.0,) * 3)})
+
+    world, state = jax.jit(jax.vmap(top))(*jnp.asarray(rng.uniform(0.01, 1.0, (2, 4096))))
+    q = rng.normal(size=state.q.shape)
+    q = jnp.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+    world_and_state = world, dr.replace(state, q=q, w=jnp.asarray(rng.normal(size=state.w.shape) * 10))
+
+    def end(world, state):
+        return dr.rollout_batch(world, state, dt=1 / 60, steps=1, final_only=True).q
+
+    of_jvp = jax.jit(lambda given, along: jax.jvp(end, given, along)[0])
+    assert_same(of_jvp(world_and_state, world_and_state), end(*world_and_state), ROUNDING)
+
+
 def test_batch_of_states_shares_a_world():
     world, _ = variants()[0]
     states = [state for _, state in variants()]
