@@ -28,6 +28,7 @@ from diffrigid.contact.sides import (
     contacts_of,
     earliest,
     gap_rates,
+    moving_along,
     place,
     reach_of,
 )
@@ -63,7 +64,8 @@ def find_impact(
     slack = jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.minimum(reach_of(a), reach_of(b))
     at_a, at_b = place(a, s0, live), place(b, s0, live)
     moved = contacts_of(a, at_a, b, at_b)
-    gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
+    along = moving_along(a, at_a, s0), moving_along(b, at_b, s0)
+    gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, *along)))
     closing = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
     if len(rests) == len(gap) == 1:  # what rests would always meet next when it falls, and hide what else is met
         closing = closing & ~rests

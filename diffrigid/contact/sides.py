@@ -16,7 +16,7 @@ from diffrigid.collide.heights import candidates
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import fold, rows, sum_rows
 from diffrigid.numerics import dot, norm
-from diffrigid.pytree import array, pytree
+from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
 
@@ -159,6 +159,23 @@ def gap_rates(contacts: Contacts, at_a: Placed, at_b: Placed) -> Array:
         return dot(n, relative_velocity(at_a, p - at_a.x, at_b, p - at_b.x))
 
     return jax.vmap(one)(contacts.normal, contacts.point)
+
+
+def moving_along(side: Side, at: Placed, s: Array) -> Placed:
+    """The collider at time s (*batch) [s] with the rates of its path.
+
+    Where forces vary these are not quite its velocities: both are curves that end where the integration does.
+    """
+    f = side.flight
+    if f is None or f.jerk is None:
+        return at
+    so = rotations(f.dim)
+
+    def path(s: Array) -> tuple[Array, Array]:
+        return position(f, s), so.sine(so.difference(at.q, orientation(f, s)))
+
+    v, w = jax.jvp(path, (s,), (jnp.ones_like(s),))[1]
+    return replace(at, v=v, w=so.rotate(at.q, w) if so.D == 3 else w)
 
 
 def reach_of(side: Side) -> Array:
