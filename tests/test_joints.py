@@ -1,7 +1,5 @@
 """Joints: motions in closed form or of an integrator in NumPy, impacts of what is joined, and mistakes."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -173,8 +171,8 @@ def test_hinged_rod_rebounds():
     assert_allclose(slopes, jax.grad(expected, (0, 1, 2))(*p), atol=1e-8)
 
 
-def test_slopes_of_a_thrown_arm_are_those_of_its_motion_in_continuous_time():
-    """Two hinged boxes strike the floor with their corners, and slide: slopes differ from differences by O(dt^2)."""
+def test_slopes_of_a_thrown_arm_are_those_of_differences():
+    """Two hinged boxes strike the floor with their corners, and slide."""
     bodies = {
         "a": dr.Body(dr.Box(half=(0.3, 0.2)), mass=1.0, x=(0.0, 1.0)),
         "b": dr.Body(dr.Box(half=(0.3, 0.2)), mass=1.5, x=(0.8, 1.0)),
@@ -183,29 +181,22 @@ def test_slopes_of_a_thrown_arm_are_those_of_its_motion_in_continuous_time():
     joints = [dr.Revolute("a", "b", anchor_a=(0.4, 0.0))]
     world, state = dr.scene(bodies, gravity=(0.0, -G), restitution=0.6, friction=0.3, joints=joints)
 
-    def thrown(w, angle, steps):
+    def thrown(w, angle):
         q = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         arms = jnp.stack([-0.4 * q, 0.4 * q])
         x = jnp.array([[0.0, 1.0]]) + arms
         v = jnp.array([[0.5, 0.0]]) + w * jnp.stack([-arms[:, 1], arms[:, 0]], axis=1)
         start = dr.State(x=x, q=jnp.stack([q, q]), v=v, w=jnp.stack([w, w])[:, None])
-        return lax.fori_loop(0, steps, lambda _, state: dr.step(world, state, 0.6 / steps), start).x
+        return lax.fori_loop(0, 36, lambda _, state: dr.step(world, state, 1 / 60), start).x
 
     @jax.jit
-    @partial(jax.vmap, in_axes=(0, 0, None))
-    def ends_and_slopes(w, angle, steps):
-        return jax.jvp(lambda w: thrown(w, angle, steps), (w,), (jnp.ones_like(w),))
+    @jax.vmap
+    def ends_and_slopes(w, angle):
+        return jax.jvp(lambda w: thrown(w, angle), (w,), (jnp.ones_like(w),))
 
     w, angle, h = jnp.array([-2.0, -0.5, 1.0, 3.0]), jnp.array([0.3, 1.1, 2.0, -0.7]), 1e-6
-
-    def error(steps):
-        ends, slopes = ends_and_slopes(jnp.concatenate([w, w + h, w - h]), jnp.tile(angle, 3), steps)
-        differences = (ends[4:8] - ends[8:]) / (2 * h)
-        return jnp.abs(slopes[:4] - differences).max((1, 2)) / jnp.abs(differences).max((1, 2))
-
-    coarse, fine = error(36), error(144)
-    assert float(coarse.max()) < 1e-3
-    assert float(jnp.median(fine)) < float(jnp.median(coarse)) / 4**2
+    ends, slopes = ends_and_slopes(jnp.concatenate([w, w + h, w - h]), jnp.tile(angle, 3))
+    assert_allclose(slopes[:4], (ends[4:8] - ends[8:]) / (2 * h), atol=1e-7)
 
 
 def test_a_joint_of_others_changes_nothing():
