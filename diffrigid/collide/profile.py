@@ -5,6 +5,7 @@ with the core of the shape. A corner over a segment has the distance of its line
 as over one line. Beyond the end of a segment
 
     where it is beyond its neighbour's as well, over a convex vertex: the distance to the vertex is a contact
+    else, over a neighbour that rises from it: the distance of its line, which leads into the valley
     else, above the line of the segment: it may get there within the step, but not touch there: ALERT
     else: there is nothing to meet
 
@@ -115,6 +116,9 @@ def _corner_contacts(b: Profile, p: Array, rounding: Array, slack: Array, alert:
     best = jnp.where(over & (height < 0), height, -jnp.inf).max(0)  # inside, the least deep
     # `slack`: what is computed twice may be rounded differently.
     touches = over & ((height >= -slack[None]) | (_inside(b, p)[None] & (height >= (best - slack)[None])))
+    touches = touches | (
+        _over_valley(along, over, before - slack[None], after - slack[None]) & (height >= -slack[None])
+    )
     next_before = jnp.concatenate([before[1:], jnp.full_like(before[:1], -jnp.inf)])
     at_vertex = (after > slack[None]) & (next_before > slack[None]) & (height > slack[None])
     near_end = jnp.where((before > after)[:, None], start, end)
@@ -126,6 +130,17 @@ def _corner_contacts(b: Profile, p: Array, rounding: Array, slack: Array, alert:
     gap = jnp.where(touches, height - rounding[None], gap)
     normal = jnp.where((at_vertex | may_meet)[:, None] & ~touches[:, None], direction, up)
     return Contacts(gap=gap, normal=normal, point=p[None] - (rounding[None] + 0.5 * gap)[:, None] * normal)
+
+
+def _over_valley(along: Array, over: Array, before: Array, after: Array) -> Array:
+    """Whether a corner is over a neighbour that makes a valley with a segment, (S, *batch) bool.
+
+    There the line of the segment goes on below the neighbour: a corner that comes to it has come to the valley, even if
+    it has fallen by a little since it was last held.
+    """
+    valley, none = jax.vmap(_cross)(along[:-1], along[1:]) > TURN, jnp.zeros_like(over[:1])
+    from_last, from_next = jnp.concatenate([none, over[:-1] & valley]), jnp.concatenate([over[1:] & valley, none])
+    return (from_last & (after <= 0)) | (from_next & (before <= 0))
 
 
 def _shifted(flags: Array) -> Array:
