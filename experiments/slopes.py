@@ -6,7 +6,7 @@ Bodies of some kind are thrown at a floor and at each other, for a second at 1/6
 rest. Forward mode gives how their places and orientations change, at every step, along one random direction of the
 start, of masses, restitution and friction; beside it stand central differences of three sizes. At the end of a throw
 
-    right   they agree to 1e-4 of the largest slope so far, with the best of the three
+    right   they agree to 1e-4 of the largest slope of the throw, with the best of the three
     kinked  else, where the differences of 1e-6 and 1e-7 do not agree with each other: the paths that they compare part
     wrong   else
 
@@ -32,7 +32,7 @@ G = 9.81
 BOX, ROD, BALL = dr.Box(half=(0.2, 0.15, 0.1)), dr.Capsule(radius=0.1, half_length=0.2), dr.Sphere(radius=0.2)
 CORNERS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 GEM = dr.Hull(vertices=np.array(CORNERS) * (0.2, 0.15, 0.25) + 0.02 * np.random.default_rng(0).normal(size=(6, 3)))
-TILE, PIN = dr.Box(half=(0.2, 0.1)), dr.Capsule(radius=0.1, half_length=0.2)
+TILE = dr.Box(half=(0.2, 0.1))
 PENTAGON = dr.Polygon(vertices=[(0.2 * np.cos(t), 0.2 * np.sin(t)) for t in 0.4 * np.pi * np.arange(5)])
 HILLS = dr.HeightField(heights=0.15 * np.random.default_rng(7).normal(size=(6, 6)), spacing=0.5)
 RIDGES = dr.Profile(points=np.stack([np.linspace(-3, 3, 9), 0.2 * np.random.default_rng(3).normal(size=9)], 1))
@@ -51,7 +51,7 @@ KINDS = {  # the ground, what is thrown at it, and the joint between two
     "ball on hills": (HILLS, (BALL,), None),
     "box on hills": (HILLS, (BOX,), None),
     "gem on hills": (HILLS, (GEM,), None),
-    "pentagon and pin": (LINE, (PENTAGON, PIN), None),
+    "pentagon and rod": (LINE, (PENTAGON, ROD), None),
     "hinge in 2D": (LINE, (PENTAGON, TILE), dr.Revolute),
     "pentagon and tile on ridges": (RIDGES, (PENTAGON, TILE), None),
 }
@@ -95,7 +95,7 @@ def thrown(kind, seed):
 
 
 def judged(kind, throws):
-    """How many of the throws are right, kinked, and wrong, with their numbers."""
+    """Which of the throws are right, kinked, and wrong, and how far off each is."""
     given, change = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[thrown(kind, k) for k in range(throws)])
 
     def places(world, state):

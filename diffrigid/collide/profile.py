@@ -138,9 +138,10 @@ def _over_valley(along: Array, over: Array, before: Array, after: Array) -> Arra
     There the line of the segment goes on below the neighbour: a corner that comes to it has come to the valley, even if
     it has fallen by a little since it was last held.
     """
-    valley, none = jax.vmap(_cross)(along[:-1], along[1:]) > TURN, jnp.zeros_like(over[:1])
-    from_last, from_next = jnp.concatenate([none, over[:-1] & valley]), jnp.concatenate([over[1:] & valley, none])
-    return (from_last & (after <= 0)) | (from_next & (before <= 0))
+    none = jnp.zeros_like(over[:1])
+    valley = jnp.concatenate([(jax.vmap(_cross)(along[:-1], along[1:]) > TURN) & ~none, none])  # at its end
+    over_next = jnp.concatenate([over[1:], none])
+    return (_shifted(over & valley) & (after <= 0)) | (over_next & valley & (before <= 0))
 
 
 def _shifted(flags: Array) -> Array:

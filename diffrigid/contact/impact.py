@@ -65,7 +65,6 @@ def find_impact(
     at_a, at_b = place(a, s0, live), place(b, s0, live)
     moved = contacts_of(a, at_a, b, at_b)
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
-    along = moving_along(a, at_a, s0), moving_along(b, at_b, s0)  # for the slope only, so that a rollout is spared it
     closing = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
     if len(rests) == len(gap) == 1:  # what rests would always meet next when it falls, and hide what else is met
         closing = closing & ~rests
@@ -73,7 +72,8 @@ def find_impact(
     there = closing & (gap >= (lax.stop_gradient(level) - slack)[None])
     struck = jnp.where(there.any(0)[None], there, closing).astype(s0.dtype)
     share = struck / jnp.maximum(struck.sum(0), 1.0)[None]
-    slope = lax.stop_gradient(share * gap_rates(moved, *along)).sum(0)
+    along = moving_along(a, at_a, s0), moving_along(b, at_b, s0)
+    slope = lax.stop_gradient(share * gap_rates(moved, *along)).sum(0)  # for derivatives only: a rollout is spared it
     s = implicit_root(s0, (share * moved.gap).sum(0) - level, slope)
     # What is already inside where the paths begin is struck there, whatever its gap.
     at_once = jnp.any(closing & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
