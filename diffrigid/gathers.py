@@ -12,6 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
 FEW, MANY = 12, 40  # terms of a sum that is written out: where there are many such sums, where there are few
 
@@ -28,7 +31,61 @@ def rows(values: Array, index: tuple) -> Array:
         return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))
     if flat and index == tuple(range(first, first + len(index))):
         return values[first : first + len(index)]
-    return values.at[constant(index, "int32")].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return _pick.bind(values, index=index, axis=0)
+
+
+def _picked(values: Array, *, index: tuple, axis: int) -> Array:
+    """Rows of values along an axis, zeros where the index is -1; a tuple, or a tuple of tuples."""
+    table, front = np.array(index), (slice(None),) * axis
+    some = np.maximum(table, 0).tolist()
+    at = constant(tuple(some if table.ndim == 1 else map(tuple, some)), "int32")
+    chosen = values.at[*front, at].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    if (table >= 0).all():
+        return chosen
+    there = constant(index, "int32") >= 0
+    return jnp.where(there.reshape(*table.shape, *[1] * (values.ndim - 1 - axis)), chosen, jnp.zeros_like(chosen))
+
+
+def _shape(values: Any, *, index: tuple, axis: int) -> ShapedArray:
+    return ShapedArray((*values.shape[:axis], *np.shape(index), *values.shape[axis + 1 :]), values.dtype)
+
+
+def _summed_back(cotangent: Array, values: Any, *, index: tuple, axis: int) -> tuple[Array]:
+    """The transpose of `_picked`: to each row the sum of all that came of it. Its own would be a scatter."""
+    shape = values.aval.shape
+    flat = cotangent.reshape(*shape[:axis], -1, *shape[axis + 1 :])
+    return (_sums(flat, _places(index, shape[axis]), axis),)
+
+
+def _batched(values: tuple[Array], batch: tuple[int], *, index: tuple, axis: int) -> tuple[Array, int]:
+    before = batch[0] <= axis
+    picked = _pick.bind(values[0], index=index, axis=axis + before)
+    return picked, batch[0] if before else batch[0] + np.ndim(index) - 1
+
+
+_pick = Primitive("pick_rows")
+_pick.def_impl(jax.jit(_picked, static_argnames=("index", "axis")))
+_pick.def_abstract_eval(_shape)
+ad.deflinear2(_pick, _summed_back)
+batching.primitive_batchers[_pick] = _batched
+mlir.register_lowering(_pick, mlir.lower_fun(_picked, multiple_results=False))
+
+
+@functools.cache
+def _places(index: tuple, count: int) -> tuple[tuple[int, ...], ...]:
+    """For each of `count` rows where it is in the flat index, padded by -1."""
+    where: list[list[int]] = [[] for _ in range(count)]
+    for place, i in enumerate(np.ravel(index).tolist()):
+        if i >= 0:
+            where[i].append(place)
+    most = max(map(len, where))
+    return tuple(tuple(places + [-1] * (most - len(places))) for places in where)
+
+
+def _sums(values: Array, index: tuple[tuple[int, ...], ...], axis: int = 0) -> Array:
+    """Sums of rows of values along an axis, which is as long as the index then."""
+    table = _pick.bind(values, index=index, axis=axis)
+    return fold(jnp.add, table, axis + 1) if len(index[0]) <= FEW else table.sum(axis + 1)
 
 
 def sum_rows(values: Array, index: tuple) -> Array:
@@ -45,8 +102,7 @@ def sum_rows(values: Array, index: tuple) -> Array:
         part = values[start : start + length * len(runs)]
         sums = fold(jnp.add, part.reshape(len(runs), length, *part.shape[1:]), 1)
     else:
-        table = rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), distinct)
-        sums = fold(jnp.add, table, 1) if len(distinct[0]) <= FEW else table.sum(1)
+        sums = _sums(values, tuple(tuple(-1 if i == len(values) else i for i in row) for row in distinct))
     if distinct == index:
         return sums
     if index == tuple(row for row in distinct for _ in range(len(index) // len(distinct))):
@@ -72,12 +128,7 @@ def first_highest(values: list[Array]) -> list[Array]:
 def rows_or_zeros(values: Array, index: tuple) -> Array:
     """`rows`, where the index -1 stands for zeros."""
     table = np.array(index)
-    if (table >= 0).all():
-        return rows(values, index)
-    some = np.maximum(table, 0).tolist()
-    chosen = rows(values, tuple(some if table.ndim == 1 else map(tuple, some)))
-    there = (constant(index, "int32") >= 0).reshape(*table.shape, *[1] * (chosen.ndim - table.ndim))
-    return jnp.where(there, chosen, 0.0)
+    return rows(values, index) if (table >= 0).all() else _pick.bind(values, index=index, axis=0)
 
 
 def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]], Any]]:
