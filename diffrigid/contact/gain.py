@@ -11,6 +11,8 @@ then P0 gains as well, and is lessened likewise, from no impulse at all.
 Source: Kane & Levinson, Dynamics: Theory and Applications (1985), for the gain.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -22,7 +24,7 @@ from diffrigid.contact.mobility import Arms, Mobility, moved
 from diffrigid.contact.order import Links, hanging_together
 from diffrigid.contact.sides import at_pairs, pair_sum, pairs_of
 from diffrigid.contact.together import solve_together
-from diffrigid.numerics import dot
+from diffrigid.numerics import FOUND, dot
 from diffrigid.pytree import replace
 
 
@@ -34,6 +36,8 @@ def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms
     Args:
         deep: (C, *batch) bool: contacts of bodies that are deep inside each other.
     """
+    policy = jax.checkpoint_policies.save_only_these_names(FOUND)
+    again = functools.partial(jax.checkpoint, prevent_cse=False, policy=policy)
     may_gain = jnp.where((cone.target > 0) | deep, cone.on, 0.0)
     if cone.most is not None:
         may_gain = jnp.where(jnp.isinf(cone.most), may_gain, 0.0)
@@ -48,12 +52,14 @@ def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms
         over, suspect = _summed(cone, arms, mobility, T, lax.stop_gradient(may_gain))
         return any_world((over > lax.stop_gradient(rounding(P))) & (suspect > 0))
 
+    @again
     def one(needed: Array, rough: Array) -> tuple[Array, tuple[Array, Array]]:
         spin = None if cone.spin is None else rough * cone.spin
         P = solve_together(needed, replace(cone, mu=rough * cone.mu, spin=spin), v_rel, guess, arms, mobility)
         gains = lax.cond(any_may & (rough > 0), gaining, lambda _: jnp.asarray(False), P)
         return gains, (P, gains)
 
+    @again
     def towards(P0: Array, goal: tuple[Array, Array]) -> tuple[Array, None]:
         P, allowance = goal
         both = jnp.stack([P0, P - P0])

@@ -104,13 +104,17 @@ class Contact:
         always = driven(world)  # what acts in every step, and needs no impact before
         resting = jnp.broadcast_to(flags(always, start.t0), (len(always), *start.t0.shape[1:]))
 
-        # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches.
-        @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
+        tables = tables_of(world) if goes_in_rounds(world) else ()
+        # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches. That
+        # is not saved of a pass that is rarely needed: in all other steps it would be as many zeros.
+        policy = jax.checkpoint_policies.save_only_these_names(*(() if tables else (FOUND,)))
+        again = functools.partial(jax.checkpoint, prevent_cse=False, policy=policy)
+
+        @again
         def one_pass(now, phase):
             return _pass(world, now, launch, dt, phase)
 
-        tables = tables_of(world) if goes_in_rounds(world) else ()
-
+        @again
         def isolated_or_any(now, phase):
             flight = lax.stop_gradient(launch(now.anchors.state, now.anchors.t0))
             following, isolated, needed = next_impacts(world, tables, flight, now.anchors.since, dt)
