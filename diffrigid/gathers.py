@@ -78,7 +78,7 @@ def _places(index: tuple, count: int) -> tuple[tuple[int, ...], ...]:
     for place, i in enumerate(np.ravel(index).tolist()):
         if i >= 0:
             where[i].append(place)
-    most = max(map(len, where))
+    most = max(1, *map(len, where))
     return tuple(tuple(places + [-1] * (most - len(places))) for places in where)
 
 

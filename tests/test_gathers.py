@@ -16,6 +16,7 @@ CASES = {
     "one": (rows, (2, 2, 2)),
     "table": (rows, ((0, 2), (1, 1), (3, 0))),
     "zeros": (rows_or_zeros, (2, -1, 0, 0)),
+    "nothing": (rows_or_zeros, (-1, -1)),
     "table with zeros": (rows_or_zeros, ((0, -1, 3), (2, 2, -1))),
     "sums": (sum_rows, ((0, 2), (3, COUNT), (0, 1))),
     "sums of runs": (sum_rows, ((0, 1), (2, 3))),

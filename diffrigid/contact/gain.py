@@ -36,6 +36,7 @@ def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms
     Args:
         deep: (C, *batch) bool: contacts of bodies that are deep inside each other.
     """
+    # Each number that a loop saves for reverse mode is an operation more, so all but impulses are computed again.
     policy = jax.checkpoint_policies.save_only_these_names(FOUND)
     again = functools.partial(jax.checkpoint, prevent_cse=False, policy=policy)
     may_gain = jnp.where((cone.target > 0) | deep, cone.on, 0.0)
