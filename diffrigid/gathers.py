@@ -1,7 +1,7 @@
 """Rows of arrays that are picked, summed and packed by indices that are known when tracing.
 
 XLA does not vectorise a gather on a CPU, and runs a scatter, its transpose, row by row: each function here gathers only
-where slices and reshapes do not do.
+where slices and reshapes do not do, and the transpose of what is gathered is a sum of what is gathered in turn.
 """
 
 import functools
@@ -20,12 +20,7 @@ FEW, MANY = 12, 40  # terms of a sum that is written out: where there are many s
 
 
 def rows(values: Array, index: tuple) -> Array:
-    """values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples.
-
-    A NumPy array made on the spot would be an argument of every loop and branch around it, and one of what
-    reverse mode saves: a program of some hundred contacts took three times as long to compile. This one is
-    made once.
-    """
+    """values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples."""
     first, flat = index[0], not isinstance(index[0], tuple)
     if flat and index == (first,) * len(index):
         return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))
@@ -160,7 +155,11 @@ def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]
 
 @functools.cache
 def constant(table: tuple, dtype: str) -> np.ndarray:
-    """A tuple, or a tuple of tuples, as an array that is made once; see `rows`."""
+    """A tuple, or a tuple of tuples, as an array that is made once.
+
+    A NumPy array made on the spot would be an argument of every loop and branch around it, and one of what reverse mode
+    saves: a program of some hundred contacts took three times as long to compile.
+    """
     return np.array(table, dtype)
 
 

@@ -10,6 +10,7 @@ once; XLA inlines them. Tracing a gradient takes a quarter less time.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,6 +21,12 @@ from jax.custom_derivatives import SymbolicZero
 
 FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
 PASSED = "passed"  # of what a pass hands on to the next; with both, no step is computed again
+
+
+def saving(*names: str) -> Callable[[Callable], Callable]:
+    """Decorator of a loop's or branch's body: reverse mode saves what has these names, and computes the rest again."""
+    policy = jax.checkpoint_policies.save_only_these_names(*names)
+    return functools.partial(jax.checkpoint, prevent_cse=False, policy=policy)
 
 
 @jax.jit

@@ -31,7 +31,7 @@ def whole(of_arrays: Callable, *ranks: int) -> Callable:
 
 @functools.cache
 def _constant(make: Callable[[], np.ndarray], dtype: Any) -> Any:
-    """An array that is made once; see `gathers.rows`."""
+    """An array that is made once; see `gathers.constant`."""
     return make().astype(dtype)
 
 

@@ -3,7 +3,6 @@
 state -> forces -> flight -> contact [impact times -> impulses -> lever -> rest] -> state
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +18,7 @@ from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
-from diffrigid.numerics import FOUND, PASSED, with_tangents
+from diffrigid.numerics import FOUND, PASSED, saving, with_tangents
 from diffrigid.paths import read
 from diffrigid.pytree import align, array, batch_rank, pytree
 from diffrigid.shapes import traced
@@ -313,8 +312,7 @@ def fenced(world: World, saves: bool):
     does not vectorise: 34 times the forward cost instead of 6 (sixteen discs, one core).
     """
 
-    policy = jax.checkpoint_policies.save_only_these_names(*(FOUND, PASSED) * saves)
-    again = functools.partial(jax.checkpoint, prevent_cse=False, policy=policy)
+    again = saving(*(FOUND, PASSED) * saves)
 
     @again
     def one_step(state: State, dt: Array, controls: Any) -> State:

@@ -11,8 +11,6 @@ then P0 gains as well, and is lessened likewise, from no impulse at all.
 Source: Kane & Levinson, Dynamics: Theory and Applications (1985), for the gain.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -24,7 +22,7 @@ from diffrigid.contact.mobility import Arms, Mobility, moved
 from diffrigid.contact.order import Links, hanging_together
 from diffrigid.contact.sides import at_pairs, pair_sum, pairs_of
 from diffrigid.contact.together import solve_together
-from diffrigid.numerics import FOUND, dot
+from diffrigid.numerics import FOUND, dot, saving
 from diffrigid.pytree import replace
 
 
@@ -37,8 +35,7 @@ def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms
         deep: (C, *batch) bool: contacts of bodies that are deep inside each other.
     """
     # Each number that a loop saves for reverse mode is an operation more, so all but impulses are computed again.
-    policy = jax.checkpoint_policies.save_only_these_names(FOUND)
-    again = functools.partial(jax.checkpoint, prevent_cse=False, policy=policy)
+    again = saving(FOUND)
     may_gain = jnp.where((cone.target > 0) | deep, cone.on, 0.0)
     if cone.most is not None:
         may_gain = jnp.where(jnp.isinf(cone.most), may_gain, 0.0)

@@ -45,7 +45,7 @@ from diffrigid.contact.strikes import (
 )
 from diffrigid.flight import Flight, state_at
 from diffrigid.gathers import flags
-from diffrigid.numerics import FOUND, PASSED, dot, safe_divide, with_tangents
+from diffrigid.numerics import FOUND, PASSED, dot, safe_divide, saving, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
 
@@ -107,8 +107,7 @@ class Contact:
         tables = tables_of(world) if goes_in_rounds(world) else ()
         # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches. That
         # is not saved of a pass that is rarely needed: in all other steps it would be as many zeros.
-        policy = jax.checkpoint_policies.save_only_these_names(*(() if tables else (FOUND,)))
-        again = functools.partial(jax.checkpoint, prevent_cse=False, policy=policy)
+        again = saving(*(FOUND,) * (not tables))
 
         @again
         def one_pass(now, phase):
