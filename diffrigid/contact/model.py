@@ -94,13 +94,16 @@ class Contact:
         if not ends(world)["a"]:
             return state_at(launch(state, t0), dt)
         start = with_tangents(Anchors(state=state, t0=t0, since=t0 - dt[None]), (world, dt))
-        # Among so many pairs some is always near, and times are found fast.
-        near = jnp.asarray(True) if goes_in_rounds(world) else may_meet(world, launch(state, t0), dt)
-        end = self._passes(world, start, launch, dt, near)
+        passes = functools.partial(self._passes, world, launch=launch, dt=dt)
+        if goes_in_rounds(world) or any(driven(world)):  # some pair of so many is always near, or something always acts
+            end = passes(start)
+        else:
+            near = may_meet(world, launch(state, t0), dt)
+            end = lax.cond(near, passes, lambda start: start, start)
         return state_at(launch(end.state, end.t0), dt)
 
-    def _passes(self, world: Any, start: Anchors, launch: Callable, dt: Array, near: Array) -> Anchors:
-        """The anchors after all passes; there are none unless some pair is `near`, a bool."""
+    def _passes(self, world: Any, start: Anchors, launch: Callable, dt: Array) -> Anchors:
+        """The anchors after all passes."""
         always = driven(world)  # what acts in every step, and needs no impact before
         resting = jnp.broadcast_to(flags(always, start.t0), (len(always), *start.t0.shape[1:]))
 
@@ -134,7 +137,8 @@ class Contact:
 
         nothing = jnp.zeros((_rows(world), *start.state.x.shape[1:]), start.t0.dtype)
         known = Known(P=nothing, early=nothing, rubs=nothing[:, 0]) if is_loaded(world) else None
-        first = Progress(start, resting, with_tangents(known, (world, dt)), near, jnp.full(dt.shape, any(always)))
+        known, rests = with_tangents(known, (world, dt)), jnp.full(dt.shape, any(always))
+        first = Progress(start, resting, known, jnp.asarray(True), rests)
         return checkpoint_name(lax.scan(maybe, first, jnp.array(self._phases(world)))[0].anchors, PASSED)
 
     def _phases(self, world: Any) -> list[int]:
