@@ -24,10 +24,11 @@ from diffrigid.step import MEMORY, aligned, at_least_one, final_state, floats, s
 from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
 LANES = 2**15  # of a chunk: one for each contact, or more, and four for each body of its worlds
-# Lanes of a contact of shapes with corners: it is searched for, and is rarely alone; and the most worlds of a chunk.
+# Lanes of a contact of shapes with corners: it is searched for, and is rarely alone; least and most worlds of a chunk.
 # Compiled for speed a small chunk costs no more calls, and what one world of it needs is computed for fewer.
-CORNER, CORNER_FOR_SPEED = 32, 128
-MOST, MOST_FOR_SPEED = 2**12, 2**8
+CORNER, CORNER_FOR_SPEED = 32, 512
+LEAST, LEAST_FOR_SPEED = 2**5, 2**4
+MOST, MOST_FOR_SPEED = 2**12, 2**6
 
 
 @uncollected
@@ -118,7 +119,8 @@ def _batch_sizes(tree) -> list[int]:
 
 def _chunk(world: World) -> int:
     """Power of two of worlds whose contacts and bodies fill LANES."""
-    corner, most = (CORNER_FOR_SPEED, MOST_FOR_SPEED) if is_for_speed() else (CORNER, MOST)
+    fast = is_for_speed()
+    corner, least, most = (CORNER_FOR_SPEED, LEAST_FOR_SPEED, MOST_FOR_SPEED) if fast else (CORNER, LEAST, MOST)
 
     def lanes(pairs):
         rounds = all(
@@ -127,9 +129,8 @@ def _chunk(world: World) -> int:
         return len(pairs.a) * pairs.count * (1 if rounds else corner)
 
     contacts = sum(map(lanes, world.pairs))
-    least = 0 if world.crowd else 5  # a crowd is wide enough by itself
     filling = 2 ** np.round(np.log2(LANES / (contacts + 4 * len(world.names))))
-    return int(np.clip(filling, 2**least, most))
+    return int(np.clip(filling, 1 if world.crowd else least, most))  # a crowd is wide enough by itself
 
 
 def _state_bytes(world: World, state: State) -> int:

@@ -13,8 +13,10 @@ from jax import lax
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}  # half to three quarters of the time to compile; a batch runs slower
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}  # a fifth less; slower by another quarter
-SPEED = (  # a loop whose step accesses fewer bytes is one function; vectors as wide as there are
-    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000",
+# A loop whose step accesses fewer bytes is one function; short loops over the worlds are not written out one by one
+# before they are vectorised, as LLVM else does up to some hundred; and vectors are as wide as there are.
+SPEED = (
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000,-unroll-full-max-count=8",
     "--xla_cpu_prefer_vector_width=512",
 )
 
