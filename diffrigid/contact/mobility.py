@@ -1,5 +1,6 @@
 """From impulses at contacts to changes of the bodies' velocities and back: J, G and J G J^T of `together`."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from diffrigid.branches import opaque_true, unfused
 from diffrigid.contact.cone import put
 from diffrigid.contact.sides import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
 from diffrigid.gathers import sum_rows
@@ -219,6 +221,8 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
         each = jax.vmap(jax.vmap(dot, (None, 0)), (0, None))
         return jax.vmap(each)(J, back)
 
+    if batch:  # else XLA computes them again for every twist of the other side
+        answers = functools.partial(unfused, opaque_true(arms.arm_a), answers)
     back_a, back_b = answers(J_a), answers(J_b)
     own = side_sum(block(mid_a, back_a), block(mid_b, back_b), arms.a, arms.b, moving)
     diagonal = jnp.eye(moving, dtype=own.dtype).reshape(moving, moving, *[1] * (own.ndim - 1))
