@@ -1,0 +1,33 @@
+"""Cosine and sine: to rounding over thousands of turns, with each other as derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from diffrigid.numerics import cos_sin
+
+RANDOM = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("most", [0.1, np.pi, 6e3])  # [rad]
+def test_cosine_and_sine(dtype, most):
+    quarters = 0.5 * np.pi * np.round(most * np.linspace(-0.6, 0.6, 41))
+    phi = np.concatenate([RANDOM.uniform(-most, most, 10_000), quarters[np.abs(quarters) <= most]]).astype(dtype)
+    known = np.cos(phi.astype(np.longdouble)), np.sin(phi.astype(np.longdouble))
+    for found, value in zip(jax.jit(cos_sin)(phi), known, strict=True):
+        assert found.dtype == dtype
+        assert np.abs(np.asarray(found, np.longdouble) - value).max() < 1.3 * np.finfo(dtype).eps
+
+
+def test_derivatives_of_cosine_and_sine():
+    phi, along = jnp.array([0.0, 0.3, -2.0, 4.0, 50.0]), jnp.array([1.0, -2.0, 0.5, 3.0, 1.0])
+    (c, s), (dc, ds) = jax.jvp(cos_sin, (phi,), (along,))
+    assert_allclose(dc, -s * along, rtol=1e-15)
+    assert_allclose(ds, c * along, rtol=1e-15)
+    (back,) = jax.vjp(cos_sin, phi)[1]((along, 2.0 * along))
+    assert_allclose(back, (2.0 * c - s) * along, rtol=1e-14)
+    second = jax.vmap(jax.jacfwd(jax.grad(lambda phi: cos_sin(phi)[0])))(phi)
+    assert_allclose(second, -c, rtol=1e-14)
