@@ -149,7 +149,7 @@ def half_turn(square: Array) -> tuple[Array, Array]:
 # pi as a sum whose first parts have trailing zeros, so that their products with small integers are exact
 _PI = {
     32: (3.140625, 9.67502593994140625e-4, 1.509957990978376432e-7),
-    64: (3.14159265346825122834, 1.2154201012607926e-10, 4.04453249591901263e-21),
+    64: (3.14159265346825122834, 1.21542010126079319532e-10, 4.04453249759190126308e-21),
 }
 
 

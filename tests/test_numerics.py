@@ -1,12 +1,14 @@
 """Cosine and sine: to rounding over thousands of turns, with each other as derivatives."""
 
+from decimal import Decimal, localcontext
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from diffrigid.numerics import cos_sin
+from diffrigid.numerics import _PI, cos_sin
 
 RANDOM = np.random.default_rng(0)
 
@@ -20,6 +22,15 @@ def test_cosine_and_sine(dtype, most):
     for found, value in zip(jax.jit(cos_sin)(phi), known, strict=True):
         assert found.dtype == dtype
         assert np.abs(np.asarray(found, np.longdouble) - value).max() < 1.3 * np.finfo(dtype).eps
+
+
+@pytest.mark.parametrize(("dtype", "error"), [(np.float32, 1e-14), (np.float64, 1e-32)])
+def test_parts_of_pi(dtype, error):
+    parts = [Decimal(float(dtype(part))) for part in _PI[np.finfo(dtype).bits]]
+    with localcontext(prec=60):
+        assert abs(sum(parts) - Decimal("3.14159265358979323846264338327950288419716939937510")) < error
+        for part in parts[:-1]:  # their products with small integers are exact
+            assert all(Decimal(float(dtype(part) * dtype(n))) == part * n for n in range(1, 1000))
 
 
 def test_derivatives_of_cosine_and_sine():
