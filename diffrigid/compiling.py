@@ -54,7 +54,7 @@ def is_own_program() -> bool:
 def compile_for_speed() -> None:
     """Have JAX compile for speed on a CPU, from here on in this process; call it before anything else uses JAX.
 
-    A loop, and so a rollout, is then one function, where XLA makes one of every few operations: two to seven times as
+    A loop, and so a rollout, is then one function, where XLA makes one of every few operations: two to eight times as
     fast for a single world, 1.5 to 4 times for a batch. Compiling takes hardly longer in 2D, a third for a gradient. In
     3D it takes half as long again, twice for a Jacobian's column and three times for a gradient. A fit, most of whose
     time is that of compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.

@@ -9,8 +9,8 @@
 
 Every pass finds contacts at a time, solves for impulses, and anchors the struck bodies anew (`apply.py`); they differ
 in the time, the target of the law, and in how long the impulse has acted. A pass that no world of the batch
-needs is skipped. An impact that the sweeps leave over is found late by the next step, with a negative time,
-and repaired.
+needs is skipped, and so are all where nothing comes near. An impact that the sweeps leave over is found late by the
+next step, with a negative time, and repaired.
 """
 
 import functools
@@ -95,7 +95,7 @@ class Contact:
             return state_at(launch(state, t0), dt)
         start = with_tangents(Anchors(state=state, t0=t0, since=t0 - dt[None]), (world, dt))
         passes = functools.partial(self._passes, world, launch=launch, dt=dt)
-        if goes_in_rounds(world) or any(driven(world)):  # some pair of so many is always near, or something always acts
+        if goes_in_rounds(world):  # among so many pairs some is always near, and times are found fast
             end = passes(start)
         else:
             near = may_meet(world, launch(state, t0), dt)
