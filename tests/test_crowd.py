@@ -14,7 +14,10 @@ ROUNDING = 1e-8  # relative: of some dozen impacts in a row, each of which magni
 
 
 def box(count, seed=3, **options):
-    """Discs that differ in everything, on a jittered lattice of 0.5 m between four walls, and fast: 5 m/s at 1/60 s."""
+    """Discs that differ in everything, on a jittered lattice of 0.5 m with pegs, between walls, and fast: 5 m/s at 1/60 s.
+
+    Statics of different kinds by turns.
+    """
     rng, side = np.random.default_rng(seed), int(np.ceil(count**0.5))
     bodies = {
         f"d{k}": dr.Body(
@@ -28,6 +31,7 @@ def box(count, seed=3, **options):
         [((1.0, 0.0), -0.3), ((-1.0, 0.0), -0.5 * side), ((0.0, 1.0), -0.3), ((0.0, -1.0), -0.5 * side)]
     ):
         bodies[f"wall{k}"] = dr.Static(dr.HalfSpace(normal=n, offset=offset))
+        bodies[f"peg{k}"] = dr.Static(dr.Disc(radius=0.05), x=0.25 + 0.5 * np.array([k + 0.1 * k, k]))
     return dr.scene(bodies, restitution=0.9, friction=0.3, restitution_falloff=0.1, **options)
 
 

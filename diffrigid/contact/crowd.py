@@ -237,9 +237,9 @@ def _meet(crowd: Crowd, walls: list[Walls], following: Next, bodies: Side, ancho
     own, others = _at(crowd.materials, a), _at(crowd.materials, b)
     blow = _blow(crowd, a, side_a, own, side_b, others, moves)
     for kind in walls:
-        row = following.b - kind.number[0]
-        hit = there & (row >= 0) & (row < len(kind.number))
-        side, others = _of_rows((kind.side, kind.materials), jnp.clip(row, 0, len(kind.number) - 1), a)
+        meets = kind.number[:, None] == following.b[None]
+        hit = there & meets.any(0)
+        side, others = _of_rows((kind.side, kind.materials), jnp.argmax(meets, 0), a)
         blow = jax.tree.map(functools.partial(jnp.where, hit), _blow(crowd, a, side_a, own, side, others, hit), blow)
     on, t, P, arm_a, arm_b = blow
 
