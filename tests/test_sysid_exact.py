@@ -91,6 +91,21 @@ def test_noise_and_intervals_are_those_of_linear_regression(fit, exact):
     assert_allclose(half, student_quantile(freedom) * np.sqrt(np.diag(covariance)[:2]), rtol=1e-6)
 
 
+def test_what_lies_beyond_the_last_window_is_left_out(records, fit):
+    """The fit of the first half a second of each record is that of records which end there."""
+    early = [dr.Record({k: v[r.observations["t"] <= r.observations["t"][0] + 0.5] for k, v in r.observations.items()},
+                       state=r.state) for r in records]  # fmt: skip
+    found = dr.fit(*point(), records, free=FREE, windows=(0.5,), progress=False)
+    matrix, right, _ = algebra(early)
+    best = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    variance = ((right - matrix @ best) ** 2).sum() / (len(right) - matrix.shape[1])
+    assert_allclose(found["gravity"].value, best[:2], atol=1e-6)
+    assert_allclose(found.noise["p.x"], np.sqrt(variance), rtol=1e-6)
+    assert_allclose(found.covariance, variance * np.linalg.inv(matrix.T @ matrix)[:2, :2], rtol=1e-5, atol=1e-12)
+    assert all(np.isnan(r["p.x"][11:]).all() for r in found.residuals)
+    assert "only the first 0.5 s of each record are fitted" in found.notes and not any("only" in n for n in fit.notes)
+
+
 def test_sandwich_is_what_leaving_out_records_gives(fit, exact):
     """The jackknife of a linear fit is exact: the fit without each record, one after the other."""
     matrix, right, owner, _ = exact

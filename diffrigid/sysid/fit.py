@@ -176,6 +176,8 @@ def finish(
     residuals = tuple(by_column(problem, point, best))
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals)
     order, alike = np.argsort(costs), costs <= costs[best] + ALIKE[0] + ALIKE[1] * costs[best]
+    if np.isfinite(problem.window):
+        remarks = [*remarks, f"only the first {problem.window:g} s of each record are fitted"]
     summary = Summary(
         parameters=parameters, noise=_all_noise(problem), costs=costs[order],
         orders=impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum())),

@@ -41,6 +41,7 @@ class Problem:
     groups: tuple[Group, ...]
     dt: float  # [s] the longest step
     width: float  # [m] of smooth impacts
+    window: float  # [s] from the start of each record; what is later has no weight
     noise: dict[str, float]  # of columns whose noise is not given with their record
     free: Mapping[Any, Any]  # as the user gave it
     observe: Mapping[str, Any]  # likewise
@@ -77,8 +78,9 @@ def make_problem(
     longest = longest_step(found, dt)
     groups = make_groups(found, (*shared, *own), len(shared), longest)
     problem = Problem(
-        tuple(found), shared, own, tuple(groups), longest, _common_width(found), {}, dict(free), dict(observe or {})
-    )
+        tuple(found), shared, own, tuple(groups), longest, _common_width(found), np.inf, {}, dict(free),
+        dict(observe or {}),
+    )  # fmt: skip
     return with_noise(problem, _noise_guesses(found))
 
 
@@ -96,14 +98,18 @@ def scene_of(run: Run) -> Scene:
 
 
 def with_noise(
-    problem: Problem, noise: Mapping[str, float], window: float = np.inf, width: float | None = None
+    problem: Problem, noise: Mapping[str, float], window: float | None = None, width: float | None = None
 ) -> Problem:
-    """The problem with weights for this noise, for the first `window` [s] of each record.
+    """The problem with weights for this noise.
 
     Args:
+        window: [s] of each record from its start; None: as it is.
         width: [m] of smooth impacts; None: as it is. Until one is smooth, none is compiled to be.
     """
-    groups, width = [], problem.width if width is None else float(width)
+    window, width = (
+        float(old if new is None else new) for old, new in ((problem.window, window), (problem.width, width))
+    )
+    groups = []
     for group in problem.groups:
         weights = {}
         for name, old in group.data.weights.items():
@@ -113,7 +119,7 @@ def with_noise(
         width_now = None if exact else jnp.asarray(width, group.data.lengths.dtype)
         data = group.data._replace(weights=weights, width=width_now)
         groups.append(replace(group, data=data))
-    return replace(problem, groups=tuple(groups), noise=dict(noise), width=width)
+    return replace(problem, groups=tuple(groups), noise=dict(noise), width=width, window=window)
 
 
 def _weights(run: Run, name: str, noise: Mapping[str, float], window: float, rows: int) -> np.ndarray:
