@@ -28,7 +28,7 @@ from diffrigid.state import (
     material_velocity,
     momentum,
 )
-from diffrigid.step import Trajectory, missed_pairs, rollout, step
+from diffrigid.step import missed_pairs, rollout, step
 from diffrigid.sysid import (
     Channel,
     Fit,
@@ -56,6 +56,7 @@ from diffrigid.sysid import (
     shares,
     student,
 )
+from diffrigid.trajectory import Trajectory
 from diffrigid.view import Player, explore, play
 from diffrigid.world import World, check
 

@@ -8,7 +8,7 @@ A trajectory stores states, not impulses, so they are inferred, one interval bet
                    momentum beyond what the forces do in the interval (least norm: where points share a load, equally)
 
 What touches a `Profile` or a `HeightField` is not found, and what it does is taken for that of other contacts of the
-same bodies. Exact for a body with one contact.
+same bodies. Nor are contacts within a crowd, which lists no pairs. Exact for a body with one contact.
 """
 
 import functools
@@ -23,8 +23,8 @@ from diffrigid.hull import hull_faces
 from diffrigid.pytree import replace
 from diffrigid.shapes import UNEVEN, Box, HalfSpace, Hull, edges, radius, vertices
 from diffrigid.state import Bodies, State, Wrench, momentum, spin
-from diffrigid.step import Trajectory
 from diffrigid.touch import Side, gaps, rotated
+from diffrigid.trajectory import Trajectory, checked
 from diffrigid.world import World
 
 SLOP = 2e-3  # of the smaller size: what counts as touching
@@ -71,10 +71,13 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     `point` (M, D) [m] and `impulse` (M, D) [N s] on `a`, or on `b` where only that moves. NumPy, without derivatives.
 
     A trajectory stores states, and not impulses: these are the least that explain its changes of momentum. Contacts
-    with a `Profile` or a `HeightField` are not found.
+    with a `Profile` or a `HeightField`, and those within a crowd (256 bodies and more, see `Contact`), are not found.
 
     Args:
         times: (F,) [s] resting contacts are given only for intervals that begin then; default all.
+
+    Raises:
+        ValueError: not what `rollout` returns, traced, or a batch.
 
     Example:
         >>> bounce = dr.contacts(trajectory)
@@ -84,6 +87,7 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
         >>> bounce.impulse.round(2).tolist()  # m (1 + e) u
         [[0.0, 7.56]]
     """
+    checked(trajectory)
     world, dim = trajectory.world, trajectory.world.dim
     some = _thinned(trajectory)
     motion, (dp, dL, push) = _motion(some), _changes(some)

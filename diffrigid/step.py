@@ -19,44 +19,14 @@ from diffrigid.convert import Numbers, largest, numbers
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import FOUND, PASSED, saving, with_tangents
-from diffrigid.paths import read
-from diffrigid.pytree import align, array, batch_rank, pytree
+from diffrigid.pytree import align, batch_rank
 from diffrigid.shapes import traced
 from diffrigid.state import State
+from diffrigid.trajectory import Trajectory
 from diffrigid.world import World, check, check_kinds
 
 MEMORY = 2**31  # [bytes] of states that reverse mode saves before it rather computes steps again
 WORLDS = 1024  # for as many of them, under `jax.vmap`, there is room where the passes of one world are saved too
-
-
-@pytree
-class Trajectory:
-    """States at the T + 1 times of a rollout; every leaf of `state` has a leading time axis, and of `controls`, of T.
-
-    Example:
-        >>> trajectory.t.shape, trajectory.state.x.shape  # the start and 30 steps
-        ((31,), (31, 1, 2))
-        >>> trajectory["ball.x"].shape, trajectory["ball.v[1]"].shape  # by path, as `dr.paths` and `fit` name them
-        ((31, 2), (31,))
-    """
-
-    t: Array = array("T")  # (T+1,) [s], from 0, or the given times
-    state: State
-    world: World
-    controls: Any = None  # as given, over each interval
-
-    def __getitem__(self, path: str) -> Array:
-        """What a path names, at every time, (T+1, ...); see `diffrigid.paths`."""
-        return jax.vmap(lambda state: read(self.world, state, path))(self.state)
-
-    def _repr_html_(self) -> str | None:
-        """The motion itself, in a notebook; a batch is shown as text."""
-        from diffrigid.view import play  # points down, so that a result draws itself
-
-        try:
-            return play(self)._repr_html_()
-        except ValueError:
-            return None
 
 
 @uncollected
@@ -215,7 +185,12 @@ def _substeps(intervals: Array, longest: Array) -> tuple[int, ...]:
         ) from None
     if not (gaps > 0).all():
         raise ValueError(f"times must increase, got steps of {gaps.min():g} s or NaN: sort them and drop repeats")
-    return tuple(int(n) for n in np.maximum(np.ceil(gaps / dt_known - 1e-6), 1))
+    return tuple(steps_in(gaps, dt_known).tolist())
+
+
+def steps_in(gaps: np.ndarray, longest: Any) -> np.ndarray:
+    """Equal steps no longer than `longest` in each gap, int; a thousandth more is the rounding of single precision."""
+    return np.maximum(np.ceil(np.asarray(gaps, float) / np.asarray(longest, float) - 1e-3), 1).astype(int)
 
 
 def advance(world: World, state: State, dt: Array, controls: Any) -> State:

@@ -67,8 +67,8 @@ def fit(
         free: what may vary: a path (see `diffrigid.paths` and `diffrigid.sysid.sensors`), or a tuple of paths that
             share one value. `each(kind)` gives every record its own.
         starts: the first is at the values of `world` and `state`, the others are random.
-        dt: [s] longest step; default the median of the intervals of t, but no more than 0.02 s where bodies touch, have
-            joints, or forces vary.
+        dt: [s] longest step; default 1.1 times the median of the intervals of t, but no more than 0.02 s where bodies
+            touch, have joints, or forces vary.
         noise: standard deviation of each column, in its unit, a number or an array like the column; what is not given
             is estimated from the residuals.
         observe: what a column observes if its name does not say so: {"tip": Marker("rod", point=(0.3, 0))}.

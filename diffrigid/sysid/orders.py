@@ -10,12 +10,12 @@ import jax
 import numpy as np
 
 from diffrigid.impacts import order_of_impacts
-from diffrigid.step import Trajectory
 from diffrigid.sysid.levenberg import Numbers
 from diffrigid.sysid.problem import LOOKED_AT, linearise
 from diffrigid.sysid.records import SAME
 from diffrigid.sysid.setup import Problem, fitted_scene
 from diffrigid.sysid.times import controls_over
+from diffrigid.trajectory import Trajectory
 
 NAMED, LISTED = 3, 8  # orders that are written out, and pairs of each
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from diffrigid.paths import unit
 from diffrigid.state import State
-from diffrigid.step import Trajectory
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
 from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
 from diffrigid.sysid.free import Free
@@ -33,6 +32,7 @@ from diffrigid.sysid.setup import (
 from diffrigid.sysid.summary import Parameter, Summary
 from diffrigid.sysid.table import html_table, text_table
 from diffrigid.sysid.times import all_times, motion
+from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
 
 SCORED = 30  # iterations for the numbers of a record that was held out
@@ -129,8 +129,9 @@ class Fit:
         scene, run = self.scenes[record], self.problem.runs[record]
         wanted = all_times(run) if times is None else np.asarray(times, float)
         if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME or not (np.diff(wanted) > 0).all():
+            given = f"times has shape {wanted.shape}" + (f" and begins at {wanted.flat[0]:g} s" if wanted.size else "")
             raise ValueError(
-                f"times is {times!r}: expected increasing times from {run.start:g} s on, where record {record} starts"
+                f"{given}: expected increasing times from {run.start:g} s on, where record {record} starts"
             )
         return motion(scene, run, wanted, self.problem.dt if dt is None else dt)
 

@@ -8,19 +8,24 @@ import numpy as np
 
 from diffrigid.convert import positive
 from diffrigid.forces import is_constant
-from diffrigid.step import Trajectory, rollout
+from diffrigid.step import rollout, steps_in
 from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.records import SAME, Run
+from diffrigid.trajectory import Trajectory
 
 LONGEST = 0.02  # [s] of a step, where its length is not given and matters
+JITTER = 1.1  # [-] of the usual interval: one that is longer by less is still one step
 
 
 def longest_step(found: Sequence[Run], dt: float | None) -> float:
-    """[s] as given; default the median of the intervals between times, or LONGEST where forces vary or bodies touch."""
+    """[s] as given; default the median of the intervals between times, a tenth more for those of a clock that jitters.
+
+    Where forces vary or bodies may touch no more than LONGEST.
+    """
     if dt is not None:
         return float(positive("dt", dt, "it is the longest step in s"))
-    frame = float(np.median(np.concatenate([np.diff(all_times(run)) for run in found])))
-    exact = all(is_constant(w.forces) and not (w.joints or w.pairs) for w in (run.world for run in found))
+    frame = JITTER * float(np.median(np.concatenate([np.diff(all_times(run)) for run in found])))
+    exact = all(is_constant(w.forces) and not (w.joints or w.pairs or w.crowd) for w in (run.world for run in found))
     return frame if exact else min(frame, LONGEST)
 
 
@@ -67,7 +72,7 @@ def grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Lengths of the steps that land on every measured time, and for each column the state of each of its rows."""
     t = _with_changes(run, all_times(run))
     gaps = np.diff(t)
-    counts = np.maximum(np.ceil(gaps / longest - 1e-6), 1).astype(int)
+    counts = steps_in(gaps, longest)
     ends = np.concatenate([[0], np.cumsum(counts)])
     index = {s.name: ends[np.clip(np.searchsorted(t, s.t - SAME), 0, len(t) - 1)] for s in run.series}
     return np.repeat(gaps / counts, counts), index

@@ -16,7 +16,8 @@ from jax import Array
 from diffrigid import paths
 from diffrigid.compiling import QUICK, uncollected
 from diffrigid.state import State
-from diffrigid.step import Trajectory, at_least_one, floats, rollout, step_length
+from diffrigid.step import at_least_one, floats, rollout, step_length
+from diffrigid.trajectory import Trajectory
 from diffrigid.view.frames import record
 from diffrigid.view.play import Player, play
 from diffrigid.world import World, check

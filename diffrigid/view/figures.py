@@ -11,9 +11,9 @@ import numpy as np
 
 from diffrigid import state as of_state
 from diffrigid.pytree import align
-from diffrigid.step import Trajectory
 from diffrigid.touch import rotated
-from diffrigid.view.frames import checked, energies
+from diffrigid.trajectory import Trajectory, checked
+from diffrigid.view.frames import energies
 from diffrigid.view.outline import outline
 
 

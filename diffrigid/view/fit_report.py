@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from diffrigid.impacts import contacts
-from diffrigid.step import Trajectory
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import Profile, profile, with_profiles
 from diffrigid.sysid.records import Series
 from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.table import HEADER, SHOWN, below, number_names, rows
+from diffrigid.trajectory import Trajectory
 from diffrigid.view.play import Player, play
 from diffrigid.view.report import Section, chart, matrix, write_report
 from diffrigid.view.report import Series as Curve

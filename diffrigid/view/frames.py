@@ -14,48 +14,17 @@ import numpy as np
 from diffrigid import impacts
 from diffrigid.forces import Gravity, SpringDamper
 from diffrigid.joints import Distance
-from diffrigid.pytree import align, batch_rank
+from diffrigid.pytree import align
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Profile, Shape, Sphere, with_topology
 from diffrigid.state import State, kinetic_energy
-from diffrigid.step import Trajectory
 from diffrigid.sysid.records import columns
 from diffrigid.sysid.sensors import Part
 from diffrigid.touch import rotated
+from diffrigid.trajectory import Trajectory
 from diffrigid.view.outline import nodes
 from diffrigid.world import World
 
 LEVELS = 65534  # of a packed number; 65535 is NaN
-
-
-def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
-    """The trajectory, if it is one of a single world with known values.
-
-    Raises:
-        ValueError: something else, traced, or a batch.
-    """
-    if isinstance(trajectory, State):
-        raise ValueError(
-            f"{name} is a State: expected what `rollout` returns; of states of `rollout_batch` pick a world, "
-            "Trajectory(t=t, state=jax.tree.map(lambda leaf: leaf[0], states), world=world)"
-        )
-    if not isinstance(trajectory, Trajectory):
-        raise ValueError(f"{name} is a {type(trajectory).__name__}: expected what `rollout` returns, or a dict of them")
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trajectory)):
-        raise ValueError(f"{name} is traced by jit, vmap or grad: draw it outside, from the result")
-    if np.ndim(trajectory.t) != 1:
-        raise ValueError(
-            f"{name}.t has shape {np.shape(trajectory.t)}, a batch in front: "
-            f"pick one with jax.tree.map(lambda leaf: leaf[0], {name})"
-        )
-    if np.ndim(trajectory.state.x) != 3 or batch_rank(trajectory.world):
-        shape = np.shape(trajectory.state.x)
-        first = "0" if len(shape) == 4 and len(trajectory.t) == shape[1] != shape[0] else "..., 0"
-        raise ValueError(
-            f"{name}.state.x has shape {shape}, expected (T+1, N, D), and {name}.world without "
-            f"a batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[{first}], {name}.state)), "
-            "and likewise in the leaves of the world that have the batch axis"
-        )
-    return trajectory
 
 
 def pack(table: np.ndarray) -> dict[str, Any]:
@@ -181,7 +150,7 @@ def links(world: World) -> list[dict[str, Any]]:
         kind = "rod" if isinstance(group, Distance) else type(group).__name__.lower()
         for row, (a, b) in enumerate(zip(group.a, group.b, strict=True)):
             ends = _short(group.anchor_a[row]), _short(group.anchor_b[row])
-            found.append({"kind": kind, "ends": [[a, ends[0]], [last if b is None else b, ends[1]]]})
+            found.append({"kind": kind, "ends": [[a, ends[0]], [b, ends[1]]]})
     for force in world.forces:
         if isinstance(force, SpringDamper):
             a, b = ((last if body is None else body) for body in (force.a, force.b))

@@ -17,8 +17,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from diffrigid.step import Trajectory
-from diffrigid.view.frames import checked, record
+from diffrigid.trajectory import Trajectory, checked
+from diffrigid.view.frames import record
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"  # nothing is ever loaded
 SHOWN = ("trails", "velocities", "contacts", "data")  # what can be shown or hidden

@@ -1,0 +1,74 @@
+"""What a rollout returns."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from diffrigid.paths import read
+from diffrigid.pytree import array, batch_rank, pytree
+from diffrigid.state import State
+from diffrigid.world import World
+
+
+@pytree
+class Trajectory:
+    """States at the T + 1 times of a rollout; every leaf of `state` has a leading time axis, and of `controls`, of T.
+
+    Example:
+        >>> trajectory.t.shape, trajectory.state.x.shape  # the start and 30 steps
+        ((31,), (31, 1, 2))
+        >>> trajectory["ball.x"].shape, trajectory["ball.v[1]"].shape  # by path, as `dr.paths` and `fit` name them
+        ((31, 2), (31,))
+    """
+
+    t: Array = array("T")  # (T+1,) [s], from 0, or the given times
+    state: State
+    world: World
+    controls: Any = None  # as given, over each interval
+
+    def __getitem__(self, path: str) -> Array:
+        """What a path names, at every time, (T+1, ...); see `diffrigid.paths`."""
+        return jax.vmap(lambda state: read(self.world, state, path))(self.state)
+
+    def _repr_html_(self) -> str | None:
+        """The motion itself, in a notebook; a batch is shown as text."""
+        from diffrigid.view import play  # points down, so that a result draws itself
+
+        try:
+            checked(self)
+        except ValueError:
+            return None
+        return play(self)._repr_html_()
+
+
+def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
+    """The trajectory, if it is one of a single world with known values.
+
+    Raises:
+        ValueError: something else, traced, or a batch.
+    """
+    if isinstance(trajectory, State):
+        raise ValueError(
+            f"{name} is a State: expected what `rollout` returns; of states of `rollout_batch` pick a world, "
+            "Trajectory(t=t, state=jax.tree.map(lambda leaf: leaf[0], states), world=world)"
+        )
+    if not isinstance(trajectory, Trajectory):
+        raise ValueError(f"{name} is a {type(trajectory).__name__}: expected what `rollout` returns, or a dict of them")
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trajectory)):
+        raise ValueError(f"{name} is traced by jit, vmap or grad: draw it outside, from the result")
+    if np.ndim(trajectory.t) != 1:
+        raise ValueError(
+            f"{name}.t has shape {np.shape(trajectory.t)}, a batch in front: "
+            f"pick one with jax.tree.map(lambda leaf: leaf[0], {name})"
+        )
+    if np.ndim(trajectory.state.x) != 3 or batch_rank(trajectory.world):
+        shape = np.shape(trajectory.state.x)
+        first = "0" if len(shape) == 4 and len(trajectory.t) == shape[1] != shape[0] else "..., 0"
+        raise ValueError(
+            f"{name}.state.x has shape {shape}, expected (T+1, N, D), and {name}.world without "
+            f"a batch: pick one with replace({name}, state=jax.tree.map(lambda leaf: leaf[{first}], {name}.state)), "
+            "and likewise in the leaves of the world that have the batch axis"
+        )
+    return trajectory
