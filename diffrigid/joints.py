@@ -69,21 +69,22 @@ class Revolute:
 
     def coordinate(self, so: ModuleType, a: Pose, b: Pose) -> Array:
         """Angle of a against b about the axis, (*batch) [rad], within pi of the middle of its limits, else of 0."""
-        turned, zero, middle = so.difference(b.q, a.q), self.zero, self._middle()
+        turned, zero = so.difference(b.q, a.q), self.zero
+        middle = middle_of(*(None if limit is None else jnp.asarray(limit) for limit in (self.lower, self.upper)))
         if middle is not None:
             zero = so.turn_in_body(zero, middle[None] if so.D == 2 else middle[None] * self.axis_a)
         angle = so.log(turned if zero is None else so.difference(zero, turned))
         along = angle[0] if so.D == 2 else dot(self.axis_a, angle)
         return along if middle is None else middle + along
 
-    def _middle(self) -> Array | None:
-        """Angle half a turn from that at which angles jump, (*batch) [rad]; None: there are no limits."""
-        lower, upper = (None if limit is None else jnp.asarray(limit) for limit in (self.lower, self.upper))
-        if lower is not None and upper is not None:
-            return 0.5 * (lower + upper)
-        if lower is not None:
-            return lower + 0.75 * jnp.pi
-        return None if upper is None else upper - 0.75 * jnp.pi
+
+def middle_of(lower: Any, upper: Any) -> Any:
+    """Angle [rad] half a turn from that at which the angle of a hinge jumps; None: there are no limits."""
+    if lower is not None and upper is not None:
+        return 0.5 * (lower + upper)
+    if lower is not None:
+        return lower + 0.75 * jnp.pi
+    return None if upper is None else upper - 0.75 * jnp.pi
 
 
 @pytree

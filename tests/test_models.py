@@ -202,6 +202,8 @@ LEFT_OUT = {
     "actuator": (mjcf(BALL) .replace("</mujoco>", '<actuator><motor joint="a"/></actuator></mujoco>'), r"actuator \(motor\)"),
     "stiffness": (mjcf('<body name="a"><joint name="j" stiffness="3"/><geom size="0.1" pos="1 0 0"/></body>'), "stiffness of joint 'j'"),
     "margin": (mjcf(BALL.replace("size", 'name="g" margin="0.1" size')), "margin of geom 'g'"),
+    "a full turn": (mjcf('<body name="a"><joint name="j" range="-180 180"/><geom size="0.1" pos="1 0 0"/></body>'), "lower limit -3.14159 rad and upper limit 3.14159 rad of j"),
+    "a limit a turn away": (mjcf('<body name="a"><joint name="j" range="300 400"/><geom size="0.1" pos="1 0 0"/></body>'), "lower limit 5.23599 rad and upper"),
     "second geom": (mjcf(BALL.replace("</body>", '<geom name="g2" size="0.1"/></body>')), "g2, the second shape of ball"),
     "off centre": (mjcf(BALL.replace("<geom", '<inertial pos="1 0 0" mass="1" diaginertia="1 1 1"/><geom name="g"')), "g, which is off the centre"),
 }  # fmt: skip
@@ -212,6 +214,13 @@ def test_what_is_left_out_is_named(case, write):
     text, message = LEFT_OUT[case]
     with pytest.warns(UserWarning, match=f"model.xml: left out: .*{message}"):
         dr.load_mjcf(write(text))
+
+
+def test_limits_of_a_hinge_may_lie_beyond_half_a_turn(write):
+    world, state = dr.load_mjcf(
+        write(mjcf('<body name="a"><joint name="j" range="-20 270"/><geom size="0.1" pos="1 0 0"/></body>'))
+    )
+    assert_allclose([read(world, state, f"j.{side}") for side in ("lower", "upper")], np.deg2rad([-20.0, 270.0]))
 
 
 REFUSED = {

@@ -20,7 +20,6 @@ from diffrigid.state import State
 from diffrigid.world import World
 
 CENTRED = 1e-6  # [-] of its size by which a shape may be off the centre of mass
-HALF_TURN = np.pi * (1 + 1e-9)  # [rad] angles of hinges are between -pi and pi
 
 
 @dataclass(frozen=True)
@@ -177,14 +176,21 @@ def _joint(link: Link, frames: dict[str, Frame], skipped: list[str]) -> Any:
         return (joints.Ball if joint.kind == "ball" else joints.Weld)(**ends)
     drive: dict[str, Any] = {name: value for name in ("damping", "friction") if (value := getattr(joint, name)) > 0}
     limits = {"lower": joint.lower, "upper": joint.upper}
-    for side, value in limits.items():
-        if value is not None and joint.kind == "hinge" and abs(value) > HALF_TURN:
-            skipped.append(f"{side} limit {value:g} rad of {joint.name or link.name}, beyond half a turn")
-        elif value is not None:
-            drive[side] = value
+    limits = {side: value for side, value in limits.items() if value is not None}
+    if joint.kind == "hinge" and limits and not _are_told_apart(**limits):
+        texts = " and ".join(f"{side} limit {value:g} rad" for side, value in limits.items())
+        skipped.append(f"{texts} of {joint.name or link.name}, which is known up to full turns")
+    else:
+        drive |= limits
     if joint.kind == "hinge":
         return joints.Revolute(**ends, **drive, axis_a=axes.R.T @ axis)
     return joints.Prismatic(**ends, **drive, axis_b=axis if parent is None else frames[parent].R.T @ axis)
+
+
+def _are_told_apart(lower: float | None = None, upper: float | None = None) -> bool:
+    """Whether the angle of a hinge, known up to full turns, is 0 at the start, and between its limits within a turn."""
+    spans = np.inf if lower is None or upper is None else upper - lower
+    return abs(joints.middle_of(lower, upper)) < np.pi and not 2 * np.pi <= spans < np.inf
 
 
 def _ignored(shapes: dict[str, tuple[str, Geometry]], apart: set[frozenset[str]]) -> list[tuple[str, str]]:
