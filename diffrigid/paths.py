@@ -54,6 +54,8 @@ class Place(NamedTuple):
 def read(world: World, state: State, path: str) -> Array:
     """Value of a parameter, without batch axes: shape () or (D,) or as its leaf has it.
 
+    Of a coefficient without the name of a body, such as "restitution", that of the first body.
+
     Example:
         >>> dr.paths.read(world, state, "ball.x").tolist()
         [0.0, 1.0]

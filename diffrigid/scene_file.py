@@ -1,4 +1,4 @@
-"""Scenes in TOML files, one to one with what `scene` takes:
+"""Scenes in TOML files, and what to fit in them:
 
 gravity = [0.0, -9.81]
 restitution = 0.5
@@ -16,7 +16,8 @@ air = { drag = { linear = 0.1 } }
 
 [free]                                      # what `fit` may vary
 restitution = { interval = [0, 1] }
-"ball.v" = "real"
+"ball.v" = { each = "real" }                # a launch of its own for every file of data
+"ball.mass" = { prior = ["positive", 1.0, 0.1] }
 "a.mass = b.mass" = "positive"              # one value for both
 
 [observe]                                   # columns that are not named for what they observe
@@ -24,6 +25,7 @@ tip = { marker = { body = "ball", point = [0.1, 0.0] } }
 
 [fit]                                       # further arguments of `fit`
 starts = 8
+loss = "huber"
 noise = { "ball.x" = 0.001 }
 """
 
@@ -43,7 +45,7 @@ from diffrigid.world import World
 
 TABLES = ("bodies", "statics", "forces", "joints", "free", "observe", "fit")
 ARGUMENTS = ("gravity", *COEFFICIENTS, "ignore", "contact")
-OPTIONS = ("starts", "dt", "noise", "widths", "windows", "iterations", "seed")
+OPTIONS = ("starts", "dt", "noise", "widths", "windows", "iterations", "seed", "loss")
 KINDS: dict[str, Callable] = {
     name: getattr(sysid, name)
     for name in ("interval", "positive", "real", "direction", "rotation", "inertia", "shares")
@@ -52,11 +54,11 @@ SHAPES = {re.sub("(?<=.)([A-Z])", r"_\1", kind.__name__).lower(): kind for kind 
 FORCES = {"spring": forces.SpringDamper} | {
     kind.__name__.lower(): kind for kind in (forces.Drag, forces.Force, forces.Torque)
 }
-JOINTS = {
-    kind.__name__.lower(): kind
-    for kind in (joints.Revolute, joints.Ball, joints.Weld, joints.Prismatic, joints.Distance)
+JOINTS = {kind.__name__.lower(): kind for kind in joints.JOINTS}
+OBSERVERS: dict[str, Callable] = {
+    kind.__name__.lower(): kind for kind in (sysid.Marker, sysid.Separation, sysid.Homography, sysid.Pinhole)
 }
-OBSERVERS: dict[str, Callable] = {"marker": sysid.Marker, "separation": sysid.Separation}
+LOSSES: dict[str, Callable] = {"squares": sysid.squares, "huber": sysid.huber, "student": sysid.student}
 
 
 @dataclass(frozen=True)
@@ -98,15 +100,12 @@ def read_scene(path: str | Path) -> SceneFile:
         joints={k: _one_of(f"{path}: joints.{k}", JOINTS, entry) for k, entry in data.get("joints", {}).items()},
         **arguments,
     )
-    for key in data.get("fit", {}):
-        if key not in OPTIONS:
-            raise ValueError(f"{path}: fit.{key} is no option: {nearest(key, OPTIONS)}")
     return SceneFile(
         world=world,
         state=state,
         free={_paths(key): _kind(f"{path}: free.{key}", entry) for key, entry in data.get("free", {}).items()},
         observe={k: _observer(f"{path}: observe.{k}", entry) for k, entry in data.get("observe", {}).items()},
-        options=dict(data.get("fit", {})),
+        options=_options(f"{path}: fit", data.get("fit", {})),
     )
 
 
@@ -142,17 +141,46 @@ def _paths(key: str) -> str | tuple[str, ...]:
     return names if len(names) > 1 else names[0]
 
 
+def _options(where: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+    for key in entries:
+        if key not in OPTIONS:
+            raise ValueError(f"{where}.{key} is no option: {nearest(key, OPTIONS)}")
+    loss = {"loss": _named(f"{where}.loss", LOSSES, entries["loss"])} if "loss" in entries else {}
+    return dict(entries) | loss
+
+
 def _kind(where: str, entry: Any) -> Any:
+    """A kind of free parameter, which `each` and `prior` take in."""
+    if isinstance(entry, Mapping) and set(entry) == {"each"}:
+        return sysid.each(_kind(where, entry["each"]))
+    if isinstance(entry, Mapping) and set(entry) == {"prior"}:
+        if not isinstance(entry["prior"], list) or len(entry["prior"]) != 3:
+            raise ValueError(f"{where} is {entry!r}: expected {{ prior = [kind, mean, deviation] }}")
+        kind, mean, deviation = entry["prior"]
+        return sysid.prior(_kind(where, kind), mean, deviation)
+    return _named(where, KINDS, entry)
+
+
+def _named(where: str, kinds: Mapping[str, Callable], entry: Any) -> Any:
+    """What a name alone, or { name = arguments }, stands for."""
     if not isinstance(entry, str) and not (isinstance(entry, Mapping) and len(entry) == 1):
-        raise ValueError(f'{where} is {entry!r}: expected one kind, such as "real" or {{ interval = [0, 1] }}')
+        raise ValueError(
+            f"{where} is {entry!r}: expected one kind, a name or {{ name = arguments }}: {', '.join(kinds)}"
+        )
     name, arguments = (entry, []) if isinstance(entry, str) else next(iter(entry.items()))
-    if name not in KINDS:
-        raise ValueError(f"{where} is {name!r}: {nearest(name, KINDS)}")
+    if name not in kinds:
+        raise ValueError(f"{where} is {name!r}: {nearest(name, kinds)}")
     try:
-        return KINDS[name](*(arguments if isinstance(arguments, list) else [arguments]))
+        return kinds[name](*(arguments if isinstance(arguments, list) else [arguments]))
     except TypeError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
 def _observer(where: str, entry: Any) -> Any:
-    return entry if isinstance(entry, str) else _one_of(where, OBSERVERS, entry)
+    """An observer, others that it is of among its fields."""
+    if isinstance(entry, str):
+        return entry
+    if isinstance(entry, Mapping) and len(entry) == 1 and isinstance(fields := next(iter(entry.values())), Mapping):
+        inner = {k: _observer(f"{where}.{k}", v) for k, v in fields.items() if k in ("of", "a", "b")}
+        entry = {next(iter(entry)): {**fields, **inner}}
+    return _one_of(where, OBSERVERS, entry)

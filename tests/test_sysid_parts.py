@@ -2,23 +2,26 @@
 
 import contextlib
 import io
+import json
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.__main__ import main
 from diffrigid.impacts import order_of_impacts
 from diffrigid.scene_file import read_scene
+from diffrigid.step import steps_in
 from diffrigid.sysid.diagnosis import doubts, normality, whiteness
 from diffrigid.sysid.orders import in_words
 from diffrigid.sysid.records import columns, read_csv
 from diffrigid.sysid.sensors import channel_of, difference, predict
+from diffrigid.sysid.summary import Parameter, Summary
 
 WORLD, STATE = dr.scene(
     {
@@ -69,6 +72,28 @@ def test_rotation_is_a_turn_of_the_start():
     assert_allclose(value, dr.so3.compose(dr.so3.exp(jnp.array([0.0, 0.0, 0.3])), q), atol=1e-14)
 
 
+def test_what_is_not_finite_is_kept_in_a_file(tmp_path):
+    parameter = Parameter("a", np.array([1.0, 2.0]), np.array([-np.inf, 0.0]), np.array([np.inf, np.nan]), "m", "")
+    kept = Summary((parameter,), {"ball.x": np.nan}, np.array([1.0, np.inf]), 1, (), (), 0, 1.0, {})
+    path = kept.save(tmp_path / "fit.json")
+    json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    again = dr.load_fit(path)
+    for field in ("value", "low", "high"):
+        assert_array_equal(getattr(again["a"], field), getattr(parameter, field))
+    assert_array_equal(again.costs, kept.costs)
+    assert np.isnan(again.noise["ball.x"])
+
+
+def test_a_clock_that_jitters_takes_one_step_for_each_frame():
+    """Times to a tenth of a millisecond, and in single precision."""
+    t = np.round(np.arange(60) / 60 * 1.0003, 4)
+    data = {"t": t, "cue.x": np.zeros((60, 2))}
+    problem = sysid.make_problem(WORLD, STATE, data, free={"cue.v": dr.real()})
+    assert problem.groups[0].data.lengths.shape[0] == 59
+    single = (np.arange(36, dtype=np.float32) / np.float32(30)).astype(float)
+    assert (steps_in(np.diff(single), 1 / 30) == 1).all() and steps_in(np.array([35 / 30]), np.float32(1 / 30)) == 35
+
+
 def test_a_start_at_zero_of_a_positive_parameter_is_moved_off():
     assert_allclose(np.exp(dr.positive().unbounded(np.array([0.0, 0.2]))), [1e-3, 0.2])
 
@@ -117,6 +142,8 @@ def test_angles_are_compared_up_to_full_turns():
         (dr.Marker("coe"), "did you mean 'cue'"),
         (3.0, "expected 'ball.x', Marker"),
         (dr.Marker("cue", point=(1.0, 2.0, 3.0)), "shape"),
+        (dr.Channel("cue.q", scale=2.0), "expected none for an orientation"),
+        (dr.Pinhole("cue", x=(0.0, 0.0), q=(2.0, 0.0), focal=800.0), "q has length 2: expected 1"),
         (lambda state: state.x, "expected a number or a vector"),
     ],
 )
@@ -332,15 +359,18 @@ air = { drag = { linear = 0.1 } }
 rod = { distance = { a = "b", anchor_a = [0.0, 0.0], anchor_b = [3.0, 2.0] } }
 
 [free]
-"b.v" = "real"
+"b.v" = { each = "real" }
+"a.v" = { prior = ["real", [0.0, 1.0], 0.1] }
 restitution = { interval = [0, 1] }
 "a.mass = b.mass" = { positive = 0.2 }
 
 [observe]
 tip = { marker = { body = "b", point = [0.1, 0.0] } }
+far = { separation = { a = "a", b = { marker = { body = "b" } } } }
 
 [fit]
 starts = 2
+loss = { student = 3.0 }
 """
 
 
@@ -361,9 +391,14 @@ def test_a_scene_file_is_the_scene_it_describes(tmp_path):
     assert jax.tree.structure((found.world, found.state)) == jax.tree.structure((world, state))
     for ours, theirs in zip(jax.tree.leaves((found.world, found.state)), jax.tree.leaves((world, state)), strict=True):
         assert_allclose(ours, theirs, rtol=1e-12)
-    free = {"b.v": dr.real(), "restitution": dr.interval(0, 1), ("a.mass", "b.mass"): dr.positive(0.2)}
-    assert found.free == free and found.options == {"starts": 2}
-    assert found.observe["tip"] == dr.Marker("b", point=[0.1, 0.0])
+    free = {
+        "b.v": dr.each(dr.real()), "restitution": dr.interval(0, 1), ("a.mass", "b.mass"): dr.positive(0.2),
+        "a.v": dr.prior(dr.real(), [0.0, 1.0], 0.1),
+    }  # fmt: skip
+    assert found.free == free and found.options == {"starts": 2, "loss": dr.student(3.0)}
+    assert found.observe == {
+        "tip": dr.Marker("b", point=[0.1, 0.0]), "far": dr.Separation("a", dr.Marker("b")),
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -372,10 +407,12 @@ def test_a_scene_file_is_the_scene_it_describes(tmp_path):
         (("[bodies.a]", "[bodys.a]"), "unknown key 'bodys': did you mean 'bodies'"),
         (("disc = {", "disk = {"), "no 'disk': did you mean 'disc'"),
         (("radius = 0.1", "radios = 0.1"), "radios"),
-        (('"real"', '"reel"'), "did you mean 'real'"),
+        (('"real" }', '"reel" }'), "did you mean 'real'"),
         (("starts = 2", "start = 2"), "did you mean 'starts'"),
         (("mass = 1.0", "mass = "), "no TOML file"),
-        (('"b.v" = "real"', '"b.v" = 3'), "free.b.v is 3: expected one kind"),
+        (('{ each = "real" }', "3"), "free.b.v is 3: expected one kind"),
+        (('["real", [0.0, 1.0], 0.1]', '["real"]'), "expected { prior = "),
+        (("student", "studend"), "fit.loss is 'studend': did you mean 'student'"),
         (("{ interval = [0, 1] }", "{}"), "free.restitution is {}: expected one kind"),
         (("{ interval = [0, 1] }", "{ interval = [0] }"), "free.restitution: .*high"),
         ((SCENE, "bodies = 3"), "bodies is 3: expected a table"),

@@ -15,6 +15,7 @@ import optax
 from jax import Array
 
 from diffrigid.compiling import QUICK, uncollected
+from diffrigid.step import at_least_one
 from diffrigid.sysid.levenberg import INTERRUPTED, UNFINISHED, Numbers, Point, point_at
 from diffrigid.sysid.problem import Group, Plan, residuals_of
 
@@ -28,6 +29,7 @@ def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Ca
 
     As many as `fit` is given `iterations`, or else `steps`.
     """
+    at_least_one("steps", steps)
 
     def solve(groups, z, loss, iterations, reach, report) -> tuple[Point, str]:
         state, best, move = optimiser.init(z), None, jax.jit(_as_optax_does(optimiser.update))
@@ -51,7 +53,8 @@ def lbfgs(steps: int = 200, memory: int = 10) -> Callable:
 
     At most as many as `fit` is given `iterations`, or else `steps`.
     """
-    scale = optax.scale_by_lbfgs(memory_size=memory)
+    at_least_one("steps", steps)
+    scale = optax.scale_by_lbfgs(memory_size=at_least_one("memory", memory))
 
     def solve(groups, z, loss, iterations, reach, report) -> tuple[Point, str]:
         flat, most = _flat(z), steps if iterations is None else iterations

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.step import at_least_one
 from diffrigid.sysid.covariance import student_quantile
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, cost_of, levenberg
@@ -52,6 +53,8 @@ def profile(fit: Fit, name: str, points: int = 9) -> Profile:
         >>> bool(curve.low < 0.8 < curve.high), curve.open  # open: where the data give no limit
         (True, ())
     """
+    if at_least_one("points", points) % 2 == 0 or points < 3:
+        raise ValueError(f"points is {points}: expected an odd number from 3 on, the fitted value in the middle")
     index = _index(fit, name)
     kind: Any = next(slot.kind for slot in fit.problem.shared if slot.name == name)
     quantile = student_quantile(fit.uncertainty.freedom)

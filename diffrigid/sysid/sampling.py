@@ -28,7 +28,7 @@ from diffrigid.sysid.problem import Data, Plan, linearised
 from diffrigid.sysid.result import Fit, references, unit_of
 from diffrigid.sysid.setup import Problem, scene_of
 from diffrigid.sysid.summary import Parameter
-from diffrigid.sysid.table import rows
+from diffrigid.sysid.table import rows_of
 from diffrigid.tables import lined_up
 
 ACCEPTED = 0.8  # [-] share of proposals that the length of the steps is tuned to
@@ -52,14 +52,11 @@ class Posterior:
         return self.draws[name]
 
     def __repr__(self) -> str:
-        def quality(name: str) -> tuple[str, str]:
-            name = name.split("{")[0].split("[")[0]
-            return f"{self.r_hat[name]:.3f}", f"{self.size[name]:.0f}"
-
-        table = [
-            (name, mean, interval, fitted[2], unit, *quality(name))
-            for (name, mean, interval, unit, _), fitted in zip(rows(self), rows(self.fit), strict=True)
-        ]
+        table = []
+        for p, of_fit in zip(self.parameters, self.fit.parameters, strict=True):
+            quality = f"{self.r_hat[p.name]:.3f}", f"{self.size[p.name]:.0f}"
+            for (name, mean, interval, unit, _), fitted in zip(rows_of(p), rows_of(of_fit), strict=True):
+                table.append((name, mean, interval, fitted[2], unit, *quality))
         return "\n".join([*lined_up(HEADER, table), *(f"! {note}" for note in self.notes)])
 
 

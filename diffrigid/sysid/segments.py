@@ -97,8 +97,13 @@ def fit_in_pieces(
             in each piece as in `state`.
         free: of the whole record, the initial state among it.
         starts: of the fit in pieces; the whole record is fitted from the best.
-        options: others of `fit`, but `windows`, which grow with the pieces.
+        options: others of `fit`, but for `windows`, which grow with the pieces, `observe` and `resume`.
+
+    Raises:
+        ValueError: a body whose position is no column; one of those options.
     """
+    if taken := {"windows", "observe", "resume"} & set(options):
+        raise ValueError(f"fit_in_pieces: expected no {min(taken)}: use segments and fit, as its module shows")
     pieces = segments(world, state, observations, count)
     shared = {key: kind for key, kind in free.items() if not _initial(world, key)}
     first = fit(world, state, pieces, free=shared | _own_states(world, observations), starts=starts, **options)

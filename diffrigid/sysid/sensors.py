@@ -3,7 +3,7 @@
 An observer is a callable record `observer(state) -> (size, *batch)` for one time; its float leaves can be fitted by
 the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point". Every column has besides
 
-    COLUMN.bias     (size,)  what it reads too much, in its unit
+    COLUMN.bias     (size,)  what it reads where it should read 0, in its unit
     COLUMN.scale    [-]      what it reads per unit
     COLUMN.clock    [s]      how far its clock is ahead: a time t of it is the time t - clock of the simulation
 """
@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid import so3
-from diffrigid.convert import nearest, numbers
+from diffrigid.convert import nearest, numbers, unit_quaternion
 from diffrigid.numerics import norm
 from diffrigid.pytree import Leaf, array, array_fields, map_arrays, pytree, replace, static
 from diffrigid.state import State, material_point, rotations
@@ -155,14 +155,17 @@ def predict(channel: Channel, states: State) -> Array:
 
 def difference(channel: Channel, states: State, measured: Array) -> Array:
     """Predicted minus measured, (K, size of the residual, *batch); angles and turns in rad, at most half a turn."""
-    field = channel.observer.field if isinstance(channel.observer, Part) else ""
-    if field == "q":
-        so = rotations(states.x.shape[2])
-        q = states.q[:, channel.observer.body]
-        back = jnp.concatenate([measured[:, :1], -measured[:, 1:]], axis=1) + jnp.zeros_like(q)
-        return jax.vmap(lambda back, q: so.log(so.compose(back, q)))(back, q)
+    if _is_turn(channel):
+        so, q = rotations(states.x.shape[2]), states.q[:, channel.observer.body]
+        return jax.vmap(lambda measured, q: so.log(so.difference(measured, q)))(measured + jnp.zeros_like(q), q)
     away = predict(channel, states) - measured
-    return jnp.arctan2(jnp.sin(away), jnp.cos(away)) if field == "angle" else away
+    is_angle = isinstance(channel.observer, Part) and channel.observer.field == "angle"
+    return jnp.arctan2(jnp.sin(away), jnp.cos(away)) if is_angle else away
+
+
+def _is_turn(channel: Channel) -> bool:
+    """Whether a column is a whole orientation, which has no bias or scale."""
+    return isinstance(channel.observer, Part) and channel.observer.field == "q"
 
 
 def channel_of(name: str, what: Any, world: World) -> Channel:
@@ -178,14 +181,18 @@ def channel_of(name: str, what: Any, world: World) -> Channel:
         sizes["M"] = size_of(observer, world)
     except (TypeError, AttributeError, LookupError) as error:
         raise ValueError(f"observe[{name!r}] fails for a state of this world: {error}") from error
-    return map_arrays(partial(_fill, sizes), replace(channel, observer=observer), name)
+    channel = map_arrays(partial(_fill, sizes), replace(channel, observer=observer), name)
+    if _is_turn(channel) and not (np.all(channel.bias == 0) and np.all(channel.scale == 1)):
+        raise ValueError(f"observe[{name!r}] has a bias or a scale, expected none for an orientation: turn the shape")
+    return channel
 
 
 def _fill(sizes: dict[str, int], leaf: Any, letters: tuple[str, ...], path: str) -> Any:
     """A leaf as an array with its axes; a number stands for all components."""
     axes = tuple(sizes[letter] for letter in letters)
     value = np.asarray(numbers(path, leaf, None))
-    return numbers(path, np.broadcast_to(value, axes) if value.ndim == 0 else value, axes)
+    value = numbers(path, np.broadcast_to(value, axes) if value.ndim == 0 else value, axes)
+    return unit_quaternion(path, value) if letters == ("Q",) else value
 
 
 def size_of(observer: Any, world: World) -> int:
@@ -249,7 +256,8 @@ def channel_paths(channels: dict[str, Channel]) -> dict[str, list[tuple[str, ...
     """Every path of the columns, and the attributes that it stands for."""
     out: dict[str, list[tuple[str, ...]]] = {"clock": [(name, "clock") for name in channels]}
     for name, channel in channels.items():
-        out |= {f"{name}.{field}": [(name, field)] for field in ("bias", "scale", "clock")}
+        fields = ("clock",) if _is_turn(channel) else ("bias", "scale", "clock")
+        out |= {f"{name}.{field}": [(name, field)] for field in fields}
         out |= {f"{name}.{'.'.join(chain)}": [(name, "observer", *chain)] for chain in _leaves(channel.observer)}
     return out
 

@@ -5,6 +5,7 @@ import platform
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -54,13 +55,20 @@ class Summary:
         return html_table(self)
 
     def save(self, path: str | Path) -> Path:
-        """Write a JSON file, which `load_fit` reads."""
-        data = asdict(self)
-        for parameter in data["parameters"]:
-            parameter |= {key: parameter[key].tolist() for key in ("value", "low", "high")}
-        data["costs"] = self.costs.tolist()
-        Path(path).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        """Write a JSON file, which `load_fit` reads; numbers that are not finite as "inf" and "nan"."""
+        Path(path).write_text(json.dumps(_plain(asdict(self)), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         return Path(path)
+
+
+def _plain(data: Any) -> Any:
+    """As JSON has it."""
+    if isinstance(data, dict):
+        return {key: _plain(value) for key, value in data.items()}
+    if isinstance(data, tuple | list):
+        return [_plain(value) for value in data]
+    if isinstance(data, np.ndarray | np.generic):
+        return _plain(data.tolist())
+    return str(data) if isinstance(data, float) and not np.isfinite(data) else data
 
 
 def load_fit(path: str | Path) -> Summary:
@@ -81,7 +89,7 @@ def load_fit(path: str | Path) -> Summary:
         orders = tuple(tuple(tuple(pairs) for pairs in start) for start in data.pop("orders"))
         return Summary(
             parameters=parameters, costs=np.asarray(data.pop("costs"), float), notes=tuple(data.pop("notes")),
-            orders=orders, **data,
+            orders=orders, noise={name: float(value) for name, value in data.pop("noise").items()}, **data,
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not a saved fit: {error}") from error

@@ -14,20 +14,24 @@ SHOWN = 3  # records whose own numbers are in the table
 
 
 def rows(fit: Any) -> list[tuple[str, ...]]:
-    """One row for every number: name, value, interval, unit, note. Of records, {0}, {1}, ..., the first three."""
+    """One row for every number: name, value, interval, unit, note."""
+    return [row for p in fit.parameters for row in rows_of(p)]
+
+
+def rows_of(p: Any) -> list[tuple[str, ...]]:
+    """The rows of one parameter. Of records, {0}, {1}, ..., the first three."""
     out: list[tuple[str, ...]] = []
-    for p in fit.parameters:
-        for index in np.ndindex(p.value.shape):
-            record, part = (index[:1], index[1:]) if p.records else ((), index)
-            if record and record[0] >= SHOWN:
-                continue
-            name = p.name + "".join(f"{{{k}}}" for k in record) + (f"[{', '.join(map(str, part))}]" if part else "")
-            value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
-            places = digits(value, low, high, 3)
-            interval = f"{low:.{places}g} .. {high:.{places}g}"
-            out.append((name, f"{value:.{places}g}", interval, p.unit or "-", p.note))
-        if p.records > SHOWN:
-            out.append((p.name, "...", "", "", f"and {p.records - SHOWN} more records"))
+    for index in np.ndindex(p.value.shape):
+        record, part = (index[:1], index[1:]) if p.records else ((), index)
+        if record and record[0] >= SHOWN:
+            continue
+        name = p.name + "".join(f"{{{k}}}" for k in record) + (f"[{', '.join(map(str, part))}]" if part else "")
+        value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
+        places = digits(value, low, high, 3)
+        interval = f"{low:.{places}g} .. {high:.{places}g}"
+        out.append((name, f"{value:.{places}g}", interval, p.unit or "-", p.note))
+    if p.records > SHOWN:
+        out.append((p.name, "...", "", "", f"and {p.records - SHOWN} more records"))
     return out
 
 
