@@ -23,7 +23,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import diffrigid as dr
-from diffrigid.sysid.levenberg import least_squares
+from diffrigid.sysid.levenberg import Numbers, Point, cost_of, minimise
+from diffrigid.sysid.losses import Squares
 
 jax.config.update("jax_enable_x64", True)
 
@@ -70,6 +71,32 @@ def draw(errors):
     axes.set(xlabel="1 / width [1/mm]", ylabel="error [m]")
     axes.legend()
     figure.savefig(Path(__file__).with_suffix(".svg"))
+
+
+def least_squares(residuals, z, iterations):
+    """Minimise half the sum of squares of any residuals from many starts, each for itself.
+
+    Args:
+        residuals: of S starts z (n, S), (m, S).
+
+    Returns:
+        z (n, S), and the cost (S).
+    """
+
+    @jax.jit
+    def linear(z):
+        units = jnp.broadcast_to(jnp.eye(len(z), dtype=z.dtype)[:, :, None], (len(z), *z.shape))
+        return residuals(z), jax.vmap(lambda unit: jax.jvp(residuals, (z,), (unit,))[1], out_axes=1)(units)
+
+    def at(z):
+        r, jac = linear(z.own[:, 0])
+        return Point(z, (r[:, None],), (jac[:, :, None],))
+
+    z = jnp.asarray(z)
+    numbers = Numbers(jnp.zeros((0, z.shape[1]), z.dtype), z[:, None])
+    reach = Numbers(numbers.shared[:, :1], jnp.full((len(z), 1, 1), jnp.inf, z.dtype))
+    point, _ = minimise(at, ((0,),), numbers, Squares(), iterations, reach, lambda count, costs: None)
+    return point.z.own[:, 0], cost_of(Squares(), point.residuals)
 
 
 def aims():

@@ -17,7 +17,6 @@ import numpy as np
 from jax import Array
 
 from diffrigid.compiling import QUICK
-from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.problem import Group, linearise
 
 STIFF = 1e7  # a damping above which a start counts as converged
@@ -241,29 +240,3 @@ def _nothing_yet(own: Array) -> tuple[Array, Array, Array]:
     """Cost, damping and `done` of `Progress` before the first step."""
     starts = jnp.zeros(own.shape[1:], own.dtype)
     return starts + jnp.inf, starts + 5e-2, starts > 0
-
-
-def least_squares(residuals: Callable[[Array], Array], z: Array, iterations: int = 60) -> tuple[Array, Array]:
-    """Minimise half the sum of squares of any residuals from many starts, each for itself.
-
-    Args:
-        residuals: of S starts z (n, S), (m, S).
-
-    Returns:
-        z (n, S), and the cost (S).
-    """
-
-    @jax.jit
-    def linear(z: Array) -> tuple[Array, Array]:
-        units = jnp.broadcast_to(jnp.eye(len(z), dtype=z.dtype)[:, :, None], (len(z), *z.shape))
-        return residuals(z), jax.vmap(lambda unit: jax.jvp(residuals, (z,), (unit,))[1], out_axes=1)(units)
-
-    def at(z: Numbers) -> Point:
-        r, jac = linear(z.own[:, 0])
-        return Point(z, (r[:, None],), (jac[:, :, None],))
-
-    z = jnp.asarray(z)
-    numbers = Numbers(jnp.zeros((0, z.shape[1]), z.dtype), z[:, None])
-    reach = Numbers(numbers.shared[:, :1], jnp.full((len(z), 1, 1), jnp.inf, z.dtype))
-    point, _ = minimise(at, ((0,),), numbers, Squares(), iterations, reach, lambda count, costs: None)
-    return point.z.own[:, 0], cost_of(Squares(), point.residuals)
