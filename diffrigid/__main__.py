@@ -100,8 +100,9 @@ def paragraphs(text: str, **values: Any) -> list[str]:
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    more = "A scene and data of your own: python -m diffrigid fit scene.toml data.csv (see fit --help)."
-    parser = argparse.ArgumentParser(prog="python -m diffrigid", description=__doc__, epilog=more)
+    what = "Two identifications, one measured and one synthetic: a table, and a page for the browser."
+    more = "To fit data of your own: python -m diffrigid fit scene.toml data.csv (see python -m diffrigid fit --help)."
+    parser = argparse.ArgumentParser(prog="python -m diffrigid", description=what, epilog=more)
     parser.add_argument("--out", default="diffrigid_report.html", metavar="FILE", help="default: %(default)s")
     parser.add_argument("--quiet", action="store_true", help="print the table only")
     return parser.parse_args(arguments)

@@ -141,7 +141,8 @@ def _state_bytes(world: World, state: State) -> int:
 def _batch_axes(world: World, controls: Any, count: int) -> list[int | None]:
     """Of each leaf of the controls the axis of the batch, or None."""
     names, leaves = controlled(world.forces), jax.tree_util.tree_leaves_with_path(controls)
-    own = [getattr(path[0], "key", None) in names and leaf.shape[-1] == count for path, leaf in leaves]
+    keys = [getattr(path[0], "key", None) if path else None for path, _ in leaves]
+    own = [key in names and leaf.shape[-1] == count for key, (_, leaf) in zip(keys, leaves, strict=True)]
     return [leaf.ndim - 1 if many else None for many, (_, leaf) in zip(own, leaves, strict=True)]
 
 

@@ -55,9 +55,9 @@ def compile_for_speed() -> None:
     """Have JAX compile for speed on a CPU, from here on in this process; call it before anything else uses JAX.
 
     A loop, and so a rollout, is then one function, where XLA makes one of every few operations: two to eight times as
-    fast for a single world, 1.5 to 4 times for a batch. Compiling takes hardly longer in 2D, a third for a gradient. In
-    3D it takes half as long again, twice for a Jacobian's column and three times for a gradient. A fit, most of whose
-    time is that of compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
+    fast for a single world, 1.5 to 4 times for a batch. Compiling takes about as long as JAX by itself needs in
+    2D, and 1.6 times (a rollout) to three times (a gradient) as long in 3D. A fit, most of whose time is that of
+    compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
 
     Raises:
         RuntimeError: JAX was in use already, so that it did not read XLA_FLAGS.
@@ -66,12 +66,14 @@ def compile_for_speed() -> None:
         >>> import diffrigid as dr  # doctest: +SKIP
         >>> dr.compile_for_speed()  # doctest: +SKIP
     """
-    flags = os.environ.get("XLA_FLAGS", "").split()
+    before = os.environ.get("XLA_FLAGS", "")
+    flags = before.split()
     os.environ["XLA_FLAGS"] = " ".join(flags + [flag for flag in SPEED if flag not in flags])
     with jax.default_device(jax.devices("cpu")[0]):
         program = _small_loop().compile().as_text()
     if "xla_cpu_small_call" in (program or ""):
         return
+    os.environ["XLA_FLAGS"] = before
     raise RuntimeError(
         "compile_for_speed: JAX was in use before, and had read XLA_FLAGS: restart Python (the kernel of a notebook) "
         "and call it right after the imports"

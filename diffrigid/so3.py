@@ -112,7 +112,9 @@ def log(q: Array) -> Array:
     square = dot(u, u)
     small = square < 1e-8
     sine = safe_sqrt(jnp.where(small, 1e-8, square))
-    scale = jnp.where(small, 2.0 / jnp.maximum(s, 0.5), 2.0 * jnp.arctan2(sine, s) / sine)
+    long = jnp.maximum(s, 0.5)
+    series = 2.0 / long * (1.0 - square / (3.0 * long * long))  # of arctan(|u| / s) / |u|
+    scale = jnp.where(small, series, 2.0 * jnp.arctan2(sine, s) / sine)
     return scale[None] * u
 
 

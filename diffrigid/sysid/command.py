@@ -4,15 +4,19 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from diffrigid import scene_file
 from diffrigid.scene_file import read_scene
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.summary import load_fit
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Fit, print the table, and write it if asked to. Files of data are records of one scene."""
-    parser = argparse.ArgumentParser(prog="python -m diffrigid fit", description=main.__doc__)
-    parser.add_argument("scene", help="TOML file, see diffrigid/scene_file.py")
+    """Fit a scene to data, and print the table. Several files of data are records of one scene, fitted together."""
+    parser = argparse.ArgumentParser(
+        prog="python -m diffrigid fit", description=main.__doc__, epilog=scene_file.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("scene", help="TOML file, as below")
     parser.add_argument("data", nargs="+", help="CSV files: columns t, ball.x[0], ball.x[1], ball.angle, ...")
     parser.add_argument("--out", metavar="FILE", help="write the result as JSON")
     parser.add_argument("--report", metavar="FILE", help="write a page for the browser")
