@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
-EXAMPLE, FROM_A_FILE = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+FROM_A_FILE, EXAMPLE = re.findall(r"```python\n(.*?)```", README, flags=re.S)
 
 
 def test_example_runs(capsys):
     exec(compile(EXAMPLE, "README.md", "exec"), {})
-    table = capsys.readouterr().out
-    assert "restitution" in table and "ball.mass" in table
+    slopes = re.findall(r"[-+.\de]+", capsys.readouterr().out)
+    assert len(slopes) == 2 and all(abs(float(slope)) > 1e-3 for slope in slopes)
 
 
 def test_example_with_a_file_finds_what_made_it(tmp_path, monkeypatch):
