@@ -1,7 +1,11 @@
 """diffrigid: differentiable rigid bodies in JAX, from measured motion to physical parameters.
 
+`scene` makes a world and a state, `rollout` moves it, `play` shows it, `fit` finds its numbers from measured columns;
+`dr.paths.catalogue(world)` lists their names.
+
 Letters of array axes, everywhere: N bodies, D space (2 or 3), A angular (1 or 3), Q orientation (2 or 4),
-S statics, C contacts, P pairs, K contacts of a pair, T time steps; trailing batch axes follow them.
+S statics, C contacts, P pairs, K contacts of a pair, R rows (of joints, or of a matrix), E equations of a joint,
+V corners of a shape, T time steps; trailing batch axes follow them. A module that needs others says so.
 """
 
 from importlib.metadata import version

@@ -101,8 +101,9 @@ def _least(like: Array) -> float:
 def safe_sqrt(x: Array) -> Array:
     """Square root, 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite), or next to it.
 
-    XLA computes x anew for each that needs it, and rounds it in other ways. So what stands in for an x that is not
-    positive is next to it, and not 1: else the root of a rounding, which is positive for one of two, would be 1.
+    Two results of one program that both need x may each have a copy of it, which XLA rounds differently: 0 in one,
+    1e-17 in the other. What stands in for an x that is not positive has to be tiny: else the root of one copy would be 1,
+    and of the other 0.
     """
     least = _least(x)
     positive = x >= least

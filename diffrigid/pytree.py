@@ -93,7 +93,7 @@ def align(node, rank: int):
 
 
 def refuse_missing(record, where: str) -> None:
-    """Raise ValueError for a float leaf that is None, but where that is its default."""
+    """Raise ValueError for a float leaf that is None, unless None is its default."""
     for field in dataclasses.fields(record):
         if "letters" in field.metadata and field.default is not None and getattr(record, field.name) is None:
             raise ValueError(f"{where}.{field.name} is None: expected numbers.")

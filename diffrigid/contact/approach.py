@@ -64,8 +64,8 @@ def touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array
 def resting(task: Task, gaps: Gaps) -> Array:
     """Contacts (K, *batch) that touch, or are about to, and close no faster than what is slow; bool.
 
-    Beside one that rests, so do those slow enough to come to rest anyway. In unsupported flight they would always close
-    next, and hide the fast impact of another corner.
+    If one contact of the pair rests, so do all that are slow enough to come to rest anyway. Else, in a flight that
+    nothing holds up, they would be found to close first, and hide the fast impact of another corner.
     """
     gap, v, acc, _ = gaps
     near, slow = (NEAR * task.size)[None], task.slow[None]

@@ -60,8 +60,9 @@ class Contact:
     Args:
         width: (*batch) [m] 0 is exact. Positive: smooth collision impulses, for paths that just miss as well. A
             traced number: anneal it to zero without recompiling.
-        rest_speed: (*batch) [m/s] slower impacts do not rebound. Nor does a faster one after which the bodies would
-            meet again before the step ends: they come to rest on each other.
+        rest_speed: (*batch) [m/s] slower impacts do not rebound (at the limits of a hinge: this number in rad/s). Nor
+            does a faster one after which the bodies would meet again before the step ends: they come to rest on each
+            other.
         sweeps: largest number of successive impacts of a body within a step. Later ones are found, and repaired, in
             the next step. A step that does not need its sweeps skips them; in a gradient each costs memory traffic.
         neighbours: for how many others near a body there is room, in a crowd of 256 bodies and more: see
@@ -220,7 +221,7 @@ def _demanded(
     if world.bodies.restitution_falloff is not None:
         restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
     stays = comes_to_rest(u, restitution * u, closing, dt[None] - strikes.s, world.contact.rest_speed[None])
-    held, resting = _held(world, strikes, resting, stays, u <= _fallen(world, flight, closing, dt), phase)
+    held, resting = _held(world, strikes, resting, stays, u <= _fallen(world, flight, strikes, closing, dt), phase)
     began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
     held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
     # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
@@ -254,7 +255,8 @@ def _held(
     return held, jnp.where(impact, resting | held | comes, jnp.where(phase == REVERSE, resting, held))
 
 
-def _fallen(world: Any, flight: Flight, closing: Array, dt: Array) -> Array:
+def _fallen(world: Any, flight: Flight, strikes: Strikes, closing: Array, dt: Array) -> Array:
     """Speed (C, *batch) [m/s] to which what rested has closed at most after a step of free fall of both bodies."""
-    fall = dt * jnp.sqrt((flight.a**2).sum(1).max(0))
-    return world.contact.rest_speed[None] + 2.0 * jnp.maximum(fall[None], closing * dt[None])
+    fall = dt[None] * jnp.sqrt((flight.a**2).sum(1))
+    of_both = jnp.maximum(at_colliders(fall, strikes.a, 0.0), at_colliders(fall, strikes.b, 0.0))
+    return world.contact.rest_speed[None] + 2.0 * jnp.maximum(of_both, closing * dt[None])

@@ -124,7 +124,7 @@ def _of_clusters(
 ) -> tuple[Array, Array]:
     """Until when each body is held, and when it takes part in an impact without restitution; (N, *batch) [s].
 
-    Infinity: it is not, or does not.
+    inf where a body is not held, or takes part in no such impact.
 
     Args:
         first, first_bounce: (N, *batch) [s] its own next impact, and that with restitution.

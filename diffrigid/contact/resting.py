@@ -20,7 +20,7 @@ from diffrigid.pytree import array, pytree, static
 class Strikes:
     """C contacts of all kinds in one list, each at its own time."""
 
-    active: Array = array("C")  # (C, *batch) bool: touching at s
+    active: Array = array("C")  # (C, *batch) bool: touching at s; once its pass is known: takes part in it
     s: Array = array("C")  # (C, *batch) [s]
     gap: Array = array("C")  # [m]
     rounding: Array = array("C")  # [m] up to which a gap may be open by it
@@ -28,13 +28,13 @@ class Strikes:
     normal: Array = array("C", "D")  # from b to a
     arm_a: Array = array("C", "D")  # [m] contact point from the centre of mass of a, world axes
     arm_b: Array = array("C", "D")
-    mid_a: Any = array(
-        "C", "D", default=None
-    )  # [m] where the impulse acts, half of the time before s; None: at the arm
+    mid_a: Any = array("C", "D", default=None)  # [m] where impulses act, half of the time before s; None: at the arm
     mid_b: Any = array("C", "D", default=None)
     turn: Any = array("C", "A", default=None)  # [rad] from the impulse at s to what acts there; None: none
     K: Array = array("C", "D", "D")  # [1/kg] effective matrix
-    v_rel: Array = array("C", "D")  # [m/s] of a against b at the contact point, before the impulse
+    # [m/s] of a against b at the contact point, before the impulse; where gaps are closed (PUSH) these along the
+    # normal, [m], so that an impulse is [kg m] and what it changes places.
+    v_rel: Array = array("C", "D")
     pull: Array = array("C", "D")  # [m/s^2] acceleration of a against b there
     rests: Array = array("C")  # bool: it touches from the start of the path on
     now: Array = array("C")  # bool: it is the turn of this impact

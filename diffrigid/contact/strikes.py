@@ -75,8 +75,10 @@ def _joined(parts: list[Strikes]) -> Strikes:
 
 
 def waits(world: Any) -> bool:
-    """Whether what rests may have to be held until an impact: something acts on it, and it meets others, or the same
-    in several points. Static."""
+    """Whether what rests may have to be held until an impact. Static.
+
+    It has if something acts on it, and it meets several others, or one of them in several points.
+    """
     column, drives = ends(world), driven(world)
     pairs = tuple(dict.fromkeys(zip(column["a"], column["b"], strict=True)))
     a, b = zip(*pairs, strict=True)

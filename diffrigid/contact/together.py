@@ -121,9 +121,11 @@ def _solutions(
 def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
     """A Newton step, from which P is brought back into the cones.
 
-    Where that gains little because contacts leave their cones, the step is taken again with these linearised where they
-    came to. Else half of the step is tried too, and the better of both made smoother; where that does not help, it is
-    the best P that is made smoother, and more so the longer it takes. Else P may go round in circles.
+    Where it gains little
+        because contacts leave their cones: the step is taken again, these contacts linearised where it led them;
+        otherwise: half of the step is tried too, and the better of both smoothed;
+        again: the best P so far is smoothed, by more rounds the longer it takes;
+        for long, among four bodies or more: P may go round in circles, and another method gives it a new start.
     """
     cone, v_rel, arms, mobility = given
     slope = slope_at(cone, now.at, _compliance(now.P))

@@ -1,4 +1,18 @@
-"""System identification: from measured columns to parameters with intervals."""
+"""System identification: from measured columns to parameters with intervals.
+
+To read it, in the order of a fit; `fit.py` runs it:
+
+    what was measured     records.py, sensors.py, times.py
+    what is free          free.py (kinds), parameters.py (where they are); losses.py
+    the problem           setup.py, problem.py (from z to residuals), clocks.py
+    solvers               levenberg.py, gradient.py; segments.py for long records
+    how sure              covariance.py, profile.py, sampling.py, diagnosis.py, orders.py
+    what comes out        result.py, summary.py, table.py, figures.py
+    before measuring      design.py
+
+Letters of array axes: K rows of a column, M numbers of a column, R records, S starts, a shared numbers z, b numbers z
+of each record, m residuals.
+"""
 
 from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
 from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
