@@ -102,8 +102,8 @@ def safe_sqrt(x: Array) -> Array:
     """Square root, 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite), or next to it.
 
     Two results of one program that both need x may each have a copy of it, which XLA rounds differently: 0 in one,
-    1e-17 in the other. What stands in for an x that is not positive has to be tiny: else the root of one copy would be 1,
-    and of the other 0.
+    1e-17 in the other. What stands in for an x that is not positive has to be tiny: else the root of one copy would
+    be 1, and of the other 0.
     """
     least = _least(x)
     positive = x >= least
