@@ -4,6 +4,8 @@ from jax import Array
 
 from diffrigid.pytree import array, pytree
 
+FAR = 1e6  # [m] gap of what cannot meet, and reach of what is boundless
+
 
 @pytree
 class Contacts:

@@ -10,12 +10,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid import so3
-from diffrigid.collide.contacts import Contacts
+from diffrigid.collide.contacts import FAR, Contacts
 from diffrigid.gathers import rows
 from diffrigid.numerics import dot, norm, normalise, unit_vector
 from diffrigid.shapes import Capsule, edge_apexes, edges, radius
 
-FAR = 1e6  # [m] gap of a crossing that does not exist
 CROSSINGS = 8  # at most: of two rectangles face to face
 PARALLEL = 1e-3  # [rad] edges closer to parallel than this do not cross
 ALIKE = 0.5  # cosine: contacts of convex bodies that touch have one normal, up to their penetration

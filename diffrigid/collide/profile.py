@@ -17,13 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.collide.contacts import Contacts
+from diffrigid.collide.contacts import FAR, Contacts
 from diffrigid.collide.distance import core_distance, reach
 from diffrigid.numerics import dot, norm, normalise
 from diffrigid.shapes import Disc, Profile, radius, vertices
 from diffrigid.state import rotations
 
-FAR = 1e6  # [m] gap of what cannot meet
 ALERT = 4e-3  # [-] of the size: least gap of what may meet within the step; above `NEAR` of the impact time
 STRAIGHT = 1e-4  # one less the cosine between two segments along which a body goes on as along one
 TURN = 1e-9  # [rad] by which a convex vertex turns at least

@@ -171,10 +171,10 @@ def _time_to(height: Array, v: Array, acc: Array) -> Array:
     """Time until height + v t + acc t^2 / 2 next falls through zero; negative if inside and closing; inf: never."""
     D = v * v - 2.0 * acc * height
     root = safe_sqrt(D)
-    closing = jnp.where((D < 0) & (height > 0), jnp.inf, safe_divide(2.0 * height, root - v))
+    until_closed = jnp.where((D < 0) & (height > 0), jnp.inf, safe_divide(2.0 * height, root - v))
     returning = jnp.where(acc < 0, safe_divide(v + root, -acc), jnp.inf)
     sunk = (height < 0) & (acc < 0) & (D < 0)
-    return jnp.where(sunk, 0.0, jnp.where(v < 0, closing, returning))
+    return jnp.where(sunk, 0.0, jnp.where(v < 0, until_closed, returning))
 
 
 def _least(times: Array) -> Array:

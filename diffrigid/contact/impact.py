@@ -65,18 +65,18 @@ def find_impact(
     at_a, at_b = place(a, s0, live), place(b, s0, live)
     moved = contacts_of(a, at_a, b, at_b)
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
-    closing = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
+    closes = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
     if len(rests) == len(gap) == 1:  # what rests would always meet next when it falls, and hide what else is met
-        closing = closing & ~rests
+        closes = closes & ~rests
     # What rested has fallen below its level since, and has no part in when the others come to theirs.
-    there = closing & (gap >= (lax.stop_gradient(level) - slack)[None])
-    struck = jnp.where(there.any(0)[None], there, closing).astype(s0.dtype)
+    there = closes & (gap >= (lax.stop_gradient(level) - slack)[None])
+    struck = jnp.where(there.any(0)[None], there, closes).astype(s0.dtype)
     share = struck / jnp.maximum(struck.sum(0), 1.0)[None]
     along = moving_along(a, at_a, s0), moving_along(b, at_b, s0)
     slope = lax.stop_gradient(share * gap_rates(moved, *along)).sum(0)  # for derivatives only: a rollout is spared it
     s = implicit_root(s0, (share * moved.gap).sum(0) - level, slope)
     # What is already inside where the paths begin is struck there, whatever its gap.
-    at_once = jnp.any(closing & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
+    at_once = jnp.any(closes & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
     s = jnp.where(at_once, begin, s)
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
     if len(rests) != len(gap):  # contacts are some of many places: of the corners of a box, or of those of a grid
@@ -84,7 +84,7 @@ def find_impact(
         rests = at_corners(a, at_a, moved, rests) if few else jnp.broadcast_to(rests.any(0), gap.shape)
     elif isinstance(b.shape, Profile):
         rests = on_next_segments(a.shape, b.shape, rests)
-    return Meeting(s=s, hit=hit | at_end, fast=closing.any(0), rests=rests & ~at_end, level=level, slack=slack)
+    return Meeting(s=s, hit=hit | at_end, fast=closes.any(0), rests=rests & ~at_end, level=level, slack=slack)
 
 
 def _round_rests(a: Side, b: Side, start: Array, rest_speed: Array) -> Array:
@@ -117,32 +117,32 @@ def _approach_straight(a: Side, b: Side, width: Array | None) -> tuple[Array, Ar
     return jnp.where(s < bound, start, s), level, found, speed
 
 
-def meet_on_line(P: Array, W: Array, R: Array, width: Array | None) -> tuple[Array, Array, Array, Array]:
-    """Two round shapes whose relative path is a line: |P + W s| = R + level.
+def meet_on_line(x: Array, v: Array, R: Array, width: Array | None) -> tuple[Array, Array, Array, Array]:
+    """Two round shapes whose relative path is a line: |x + v s| = R + level.
 
-    With D = (P.W)^2 - W^2 (P^2 - R^2), smooth: D -> eps softplus(D / eps), eps = 2 R W^2 width, and the
+    With D = (x.v)^2 - v^2 (x^2 - R^2), smooth: D -> eps softplus(D / eps), eps = 2 R v^2 width, and the
     distance at impact is the Rs >= R that this D belongs to.
 
     Args:
-        P, W: (D, *batch) [m], [m/s] of a against b at time 0.
+        x, v: (D, *batch) [m], [m/s] of a against b at time 0.
         R: (*batch) [m] sum of the radii.
         width: None is exact.
 
     Returns:
         s [s], level [m], whether they meet (bool), closing speed then [m/s]; (*batch).
     """
-    W2, closing, excess = dot(W, W), -dot(P, W), dot(P, P) - R * R
-    D_exact = closing * closing - W2 * excess
+    v2, towards, excess = dot(v, v), -dot(x, v), dot(x, x) - R * R
+    D_exact = towards * towards - v2 * excess
 
     if width is None:
         D, raised, level = D_exact, jnp.zeros_like(D_exact), jnp.zeros_like(D_exact)
     else:
-        D = if_smooth(width, lambda D: softplus(D, 2.0 * R * W2 * width), lambda D: jnp.maximum(D, 0.0), D_exact)
-        raised = safe_divide(D - D_exact, W2)
+        D = if_smooth(width, lambda D: softplus(D, 2.0 * R * v2 * width), lambda D: jnp.maximum(D, 0.0), D_exact)
+        raised = safe_divide(D - D_exact, v2)
         level = safe_sqrt(R * R + raised) - R
     root = safe_sqrt(D)
-    s = safe_divide(excess - raised, closing + root)
-    return s, level, (closing > 0) & (D > 0), root / (R + level)
+    s = safe_divide(excess - raised, towards + root)
+    return s, level, (towards > 0) & (D > 0), root / (R + level)
 
 
 def _approach_parabola(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:

@@ -43,15 +43,15 @@ def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -
     return restitution / jnp.sqrt(jnp.sqrt(1.0 + falloff * jnp.where(u > 0, u, 0.0)))
 
 
-def comes_to_rest(u: Array, rebound: Array, closing: Array, left: Array, rest_speed: Array) -> Array:
+def comes_to_rest(u: Array, rebound: Array, closing_acc: Array, left: Array, rest_speed: Array) -> Array:
     """Whether an impact does not rebound, (*batch) bool: because it is slow, or would meet again within the step.
 
     Args:
         u, rebound: [m/s] speed of closing, and that of parting, e u, by the law of restitution.
-        closing: [m/s^2] acceleration at which the bodies close: after 2 rebound / closing they are back.
+        closing_acc: [m/s^2] acceleration at which the bodies close: after 2 rebound / closing_acc they are back.
         left: [s] of the step.
     """
-    return (u <= rest_speed) | (2.0 * rebound <= closing * left)
+    return (u <= rest_speed) | (2.0 * rebound <= closing_acc * left)
 
 
 def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:

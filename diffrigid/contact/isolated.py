@@ -187,8 +187,8 @@ def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Ar
         W2, PW, excess = dot(W, W), dot(P, W), dot(P, P) - R * R
         D = PW * PW - W2 * excess
         root = jnp.sqrt(jnp.maximum(D, 0.0))
-        closing = (D > 0) & (PW + start * W2 < 0)  # 0 for a body and itself
-        s = jnp.where(closing, excess / (root - PW), jnp.inf)
+        closes = (D > 0) & (PW + start * W2 < 0)  # 0 for a body and itself
+        s = jnp.where(closes, excess / (root - PW), jnp.inf)
         s = jnp.where(s < jnp.maximum(since_a, since_b), start, s)
         rests = (root <= world.contact.rest_speed * R) & (s <= dt)
         return jnp.where(rests, RESTS, s)
@@ -229,8 +229,8 @@ def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> A
         acc = None if straight else dot(n, acc)
         s, _, found, u, sunk = meet_on_parabola(dot(n, x) - offset - radius, dot(n, v), acc, None)
         s = jnp.where(sunk | (t0 + s < since), t0, t0 + s)
-        closing = jnp.zeros_like(u) if acc is None else -acc
-        rests = comes_to_rest(u, restitution_at(u, *law) * u, closing, dt - s, world.contact.rest_speed)
+        closing_acc = jnp.zeros_like(u) if acc is None else -acc
+        rests = comes_to_rest(u, restitution_at(u, *law) * u, closing_acc, dt - s, world.contact.rest_speed)
         return jnp.where(found, jnp.where(rests & (s <= dt), RESTS, s), jnp.inf)
 
     n, offset, law = unfused(live, planes, b, own, others)

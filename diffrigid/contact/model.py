@@ -216,12 +216,12 @@ def _demanded(
     comes to rest. Held is one that rests: it is not to close, but may where its gap is open.
     """
     push, drives = phase == PUSH, flags(driven(world), dt[None])
-    u, closing = (-jax.vmap(dot)(strikes.normal, motion) for motion in (strikes.v_rel, strikes.pull))
+    u, closing_acc = (-jax.vmap(dot)(strikes.normal, motion) for motion in (strikes.v_rel, strikes.pull))
     restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
     if world.bodies.restitution_falloff is not None:
         restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
-    stays = comes_to_rest(u, restitution * u, closing, dt[None] - strikes.s, world.contact.rest_speed[None])
-    held, resting = _held(world, strikes, resting, stays, u <= _fallen(world, flight, strikes, closing, dt), phase)
+    stays = comes_to_rest(u, restitution * u, closing_acc, dt[None] - strikes.s, world.contact.rest_speed[None])
+    held, resting = _held(world, strikes, resting, stays, u <= _fallen(world, flight, strikes, closing_acc, dt), phase)
     began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
     held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
     # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
@@ -255,8 +255,8 @@ def _held(
     return held, jnp.where(impact, resting | held | comes, jnp.where(phase == REVERSE, resting, held))
 
 
-def _fallen(world: Any, flight: Flight, strikes: Strikes, closing: Array, dt: Array) -> Array:
+def _fallen(world: Any, flight: Flight, strikes: Strikes, closing_acc: Array, dt: Array) -> Array:
     """Speed (C, *batch) [m/s] to which what rested has closed at most after a step of free fall of both bodies."""
     fall = dt[None] * jnp.sqrt((flight.a**2).sum(1))
     of_both = jnp.maximum(at_colliders(fall, strikes.a, 0.0), at_colliders(fall, strikes.b, 0.0))
-    return world.contact.rest_speed[None] + 2.0 * jnp.maximum(of_both, closing * dt[None])
+    return world.contact.rest_speed[None] + 2.0 * jnp.maximum(of_both, closing_acc * dt[None])

@@ -11,13 +11,14 @@ from jax import Array, lax
 
 from diffrigid.branches import unfused
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
+from diffrigid.collide.contacts import FAR
 from diffrigid.collide.distance import reach
 from diffrigid.collide.heights import candidates
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import fold, rows, sum_rows
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
-from diffrigid.shapes import HalfSpace, HeightField, Profile
+from diffrigid.shapes import BOUNDLESS, HeightField
 from diffrigid.state import rotations
 
 
@@ -180,12 +181,8 @@ def moving_along(side: Side, at: Placed, s: Array) -> Placed:
 
 def reach_of(side: Side) -> Array:
     """Radius about the centre of mass that holds the shape, (*batch) [m]; huge for what is boundless."""
-    if isinstance(side.shape, HalfSpace):
-        return jnp.full_like(side.shape.offset, 1e6)
-    if isinstance(side.shape, Profile):
-        return jnp.full_like(side.shape.points[0, 0], 1e6)
-    if isinstance(side.shape, HeightField):
-        return jnp.full_like(side.shape.spacing, 1e6)
+    if isinstance(side.shape, BOUNDLESS):
+        return jnp.full_like(side.x[0], FAR)
     shape, offset = lax.stop_gradient((side.shape, side.offset))
     dim = side.x.shape[0] if side.flight is None else side.flight.dim
     return reach(shape, dim) if offset is None else reach(shape, dim) + norm(offset)

@@ -135,8 +135,8 @@ def _struck(
     value, slope = _rate(gap, s0)
     slope = lax.stop_gradient(slope)
     s = jnp.where(hit & free, implicit_root(s0, value, slope), jnp.where(hit, start, dt))
-    at_start, closing = _rate(frozen, lax.stop_gradient(start))
-    rests = (at_start <= slack) & (jnp.abs(closing) <= rest_speed) & ~at_end
+    at_start, rate = _rate(frozen, lax.stop_gradient(start))
+    rests = (at_start <= slack) & (jnp.abs(rate) <= rest_speed) & ~at_end
     return Meeting(s=s, hit=hit | at_end, fast=hit & (slope < -rest_speed), rests=rests[None])
 
 

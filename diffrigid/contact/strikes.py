@@ -155,18 +155,18 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
         (x_a, v_a), (x_b, v_b) = centre(a, start), centre(b, start)
         if isinstance(b.shape, HalfSpace):
             n = rotations(x_a.shape[0]).rotate(b.q, b.shape.normal)
-            apart, closing = dot(n, x_a - x_b) - b.shape.offset - reach_of(a), jnp.abs(dot(n, v_a - v_b))
+            apart, speed = dot(n, x_a - x_b) - b.shape.offset - reach_of(a), jnp.abs(dot(n, v_a - v_b))
         elif isinstance(b.shape, Profile):
             p = rotations(2).unrotate(b.q, x_a - x_b)
-            apart, closing = clearance(b.shape, p) - reach_of(a), norm(v_a - v_b)
+            apart, speed = clearance(b.shape, p) - reach_of(a), norm(v_a - v_b)
         elif isinstance(b.shape, HeightField):
-            apart, closing = height_over(b.shape, x_a, b.x, b.q) - reach_of(a), norm(v_a - v_b)
+            apart, speed = height_over(b.shape, x_a, b.x, b.q) - reach_of(a), norm(v_a - v_b)
         else:
-            apart, closing = norm(x_a - x_b) - reach_of(a) - reach_of(b), norm(v_a - v_b)
+            apart, speed = norm(x_a - x_b) - reach_of(a) - reach_of(b), norm(v_a - v_b)
         pull = jnp.zeros_like(dt)
         for f in (side.flight for side in (a, b) if side.flight is not None):
             pull = pull + norm(f.a) + (0.0 if f.jerk is None else dt * norm(f.jerk))
-        return apart <= dt * (closing + 0.5 * dt * pull) + margin
+        return apart <= dt * (speed + 0.5 * dt * pull) + margin
 
     since = jnp.zeros_like(flight.t0)
     if stops_of(world):
