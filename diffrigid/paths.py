@@ -14,6 +14,7 @@ spinning_friction.
 """
 
 import re
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -112,8 +113,19 @@ def places(world: World, path: str) -> list[Place]:
     """
     known, whole = catalogue(world), component(path)[0]
     if whole not in known:
-        raise ValueError(f"no parameter {path!r} in this world: {nearest(whole, known)}")
+        raise ValueError(f"no parameter {path!r} in this world: {hint(world, whole, known)}")
     return known[whole]
+
+
+def hint(world: World, path: str, known: Iterable[str]) -> str:
+    """What was meant by a path that is none of those known."""
+    owner, _, field = path.rpartition(".")
+    joints = [(name, group) for names, group in zip(world.joint_names, world.joints, strict=True) for name in names]
+    owners: dict[str, Any] = dict(zip(world.force_names, world.forces, strict=True)) | dict(joints)
+    of_body = owner in world.names and field in COEFFICIENTS
+    if of_body or (owner in owners and field in array_fields(owners[owner])):
+        return f"it was left out when the scene was made: give {owner} a {field} to begin with."
+    return nearest(path, known)
 
 
 def component(path: str) -> tuple[str, int | None]:

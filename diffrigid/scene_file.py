@@ -19,9 +19,11 @@ restitution = { interval = [0, 1] }
 "ball.v" = { each = "real" }                # a launch of its own for every file of data
 "ball.mass" = { prior = ["positive", 1.0, 0.1] }
 "a.mass = b.mass" = "positive"              # one value for both
+"a.mass : b.mass" = "shares"                # their ratio
 
 [observe]                                   # columns that are not named for what they observe
 tip = { marker = { body = "ball", point = [0.1, 0.0] } }
+pixels = { homography = { of = "ball", matrix = [[...], [...], [...]] } }
 
 [fit]                                       # further arguments of `fit`
 starts = 8
@@ -29,6 +31,7 @@ loss = "huber"
 noise = { "ball.x" = 0.001 }
 """
 
+import inspect
 import re
 import tomllib
 from collections.abc import Callable, Mapping
@@ -133,11 +136,14 @@ def _made(where: str, kind: Callable, fields: Any) -> Any:
     try:
         return kind(**fields)
     except TypeError as error:
-        raise ValueError(f"{where}: {str(error).removeprefix(kind.__name__ + '.')}") from None
+        taken = inspect.signature(kind).parameters
+        unknown = [name for name in fields if name not in taken] if isinstance(fields, Mapping) else []
+        text = f"no field {unknown[0]!r}: {nearest(unknown[0], taken)}" if unknown else str(error).split(".")[-1]
+        raise ValueError(f"{where}: {text}") from None
 
 
 def _paths(key: str) -> str | tuple[str, ...]:
-    names = tuple(part.strip() for part in key.split("="))
+    names = tuple(part.strip() for part in re.split("[=:]", key))
     return names if len(names) > 1 else names[0]
 
 

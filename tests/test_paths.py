@@ -165,3 +165,14 @@ def test_units_of_joints_are_those_of_an_axis_or_a_way():
     fields = (*along, "anchor_a")
     assert [paths.unit(world, f"hinge.{f}") for f in fields] == ["rad", "N m", "rad/s", "N m s/rad", "m"]
     assert [paths.unit(world, f"rail.{f}") for f in fields] == ["m", "N", "m/s", "N s/m", "m"]
+
+
+def test_a_path_of_what_was_left_out_says_so():
+    rod = dr.Body(None, mass=1.0, inertia=1.0, x=(0.0, 0.0))
+    hinged = dr.scene({"rod": rod}, joints={"hinge": dr.Revolute("rod", anchor_a=0.0)})
+    for scene, path, field in (
+        (hinged, "hinge.damping", "hinge a damping"),
+        (FLAT, "cue.rolling_friction", "cue a roll"),
+    ):
+        with pytest.raises(ValueError, match=f"left out when the scene was made: give {field}"):
+            paths.read(*scene, path)

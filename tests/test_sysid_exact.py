@@ -106,6 +106,58 @@ def test_what_lies_beyond_the_last_window_is_left_out(records, fit):
     assert "only the first 0.5 s of each record are fitted" in found.notes and not any("only" in n for n in fit.notes)
 
 
+def test_numbers_of_a_fit_by_the_names_of_its_table(fit):
+    assert fit["gravity[1]"].value == fit["gravity"].value[1] and fit["gravity[1]"].low == fit["gravity"].low[1]
+    assert_allclose(fit["p.v[0]"].value, fit["p.v"].value[:, 0])
+    for name in ("gravity[2]", "p.v[2]", "p.w"):
+        with pytest.raises(KeyError, match="there are"):
+            fit[name]
+
+
+def test_an_angle_in_degrees_is_one_in_radians():
+    """Over several turns, and read modulo a turn."""
+    t = np.arange(40) / 20
+    angle = 0.4 + 7.0 * t + 0.02 * np.random.default_rng(1).standard_normal(40)
+    free = {"p.angle": dr.real(), "p.w": dr.real()}
+    world, state = dr.scene({"p": dr.Body(None, mass=1.0, inertia=1.0, x=(0.0, 0.0), angle=0.3, w=6.8)})
+    degrees = {"deg": dr.Channel("p.angle", scale=180 / np.pi)}
+    fits = [
+        dr.fit(world, state, {"t": t, "p.angle": angle}, free=free, progress=False),
+        dr.fit(world, state, {"t": t, "deg": np.degrees(angle) % 360}, observe=degrees, free=free, progress=False),
+    ]
+    for name in free:
+        assert_allclose(fits[1][name].value, fits[0][name].value, atol=1e-7)
+        assert_allclose(fits[1][name].high, fits[0][name].high, atol=1e-7)
+    assert_allclose(fits[1].noise["deg"], np.degrees(fits[0].noise["p.angle"]), rtol=1e-6)
+
+
+def test_what_is_seen_only_together_has_no_interval():
+    """Of a ball on a floor only the sum of its radius and the height of the floor; of each record start and clock."""
+
+    def scene(height):
+        ball = dr.Body(dr.Disc(radius=0.05), mass=1.0, inertia=1.0, x=(0.0, 0.55))
+        floor = dr.Static(dr.HalfSpace(normal=(0.0, 1.0), offset=height))
+        return dr.scene({"ball": ball, "floor": floor}, gravity=(0.0, -9.81), restitution=0.7)
+
+    t = np.arange(40) / 60
+    x = np.asarray(dr.rollout(*scene(0.0), dt=1 / 60, times=t)["ball.x"])
+    free = {"floor.shape.offset": dr.real(), "ball.shape.radius": dr.positive(), "restitution": dr.interval(0, 1)}
+    x = x + 1e-3 * np.random.default_rng(0).standard_normal(x.shape)
+    found = dr.fit(*scene(0.01), {"t": t, "ball.x": x}, free=free, progress=False)
+    assert np.isinf([found[name].high for name in list(free)[:2]]).all() and np.isfinite(found["restitution"].high)
+    assert any("floor.shape.offset" in note and "ball.shape.radius" in note for note in found.notes)
+
+
+def test_a_fit_that_is_none_says_so(records):
+    """In millimetres, with the noise estimated; and a start that a joint does not allow."""
+    r = records[0].observations
+    data = {"t": r["t"], "p.x": 1e3 * r["p.x"]}
+    found = dr.fit(*point(), data, free={"gravity": dr.interval(-20, 20)}, progress=False)
+    assert found.notes[0].startswith("this is no fit: residuals of p.x are as large")
+    again = found.with_intervals(sysid.from_jacobian)
+    assert again.notes == found.notes
+
+
 def test_sandwich_is_what_leaving_out_records_gives(fit, exact):
     """The jackknife of a linear fit is exact: the fit without each record, one after the other."""
     matrix, right, owner, _ = exact

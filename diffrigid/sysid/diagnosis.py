@@ -10,7 +10,8 @@ from diffrigid.sysid.covariance import Linear, eliminated
 from diffrigid.sysid.free import Free
 
 ALIKE = 1e-8  # [-] eigenvalue of the scaled information below which effects are the same: a correlation of 1 - 1e-8
-SMALL = 0.05  # [-] parts of a direction below this of its largest are rounding
+ROUNDING = 1e-12  # [-] of the largest effect: what has no more has none
+SMALL = 0.05  # [-] parts of a direction below this of its largest are rounding, each as large as its effect
 LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that says nothing of it
 RARE = 1e-3  # chance below which residuals are not taken for noise
 LAGS = 5  # frames over which residuals are compared with themselves
@@ -55,7 +56,7 @@ def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[
     J = _first_record(linear, len(coordinates))
     sizes = np.sqrt((J**2).sum(0))
     top = max(sizes.max(), 1e-300)
-    unseen = sizes < 1e-12 * top
+    unseen = sizes < ROUNDING * top
     out = []
     for path in dict.fromkeys(c.path for c in coordinates):
         mine = np.array([c.path == path for c in coordinates])
@@ -69,7 +70,8 @@ def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[
     values, vectors = np.linalg.eigh(scaled.T @ scaled) if len(seen) else (np.zeros(0), np.zeros((0, 0)))
     for vector in reduced(vectors[:, values < ALIKE * values.max(initial=1e-300)].T):
         direction = np.zeros(len(coordinates))
-        direction[seen] = vector / sizes[seen]
+        kept = np.abs(vector) >= SMALL * np.abs(vector).max()
+        direction[seen] = np.where(kept, vector, 0.0) / sizes[seen]
         out.append(_blind(direction, coordinates))
     return out
 
@@ -101,7 +103,6 @@ def _first_record(linear: Linear, numbers: int) -> np.ndarray:
 
 
 def _blind(direction: np.ndarray, coordinates: Sequence[Coordinate]) -> Blind:
-    direction = np.where(np.abs(direction) < SMALL * np.abs(direction).max(), 0.0, direction)
     parts = [(c, v) for c, v in zip(coordinates, direction, strict=True) if v != 0]
     names = tuple(dict.fromkeys(c.path for c, _ in parts))
     return Blind(direction, names, _words(parts))
@@ -175,18 +176,19 @@ def normality(r: np.ndarray) -> float:
     return float(np.exp(-0.5 * statistic))  # chi^2 with two degrees of freedom
 
 
-def doubts(series: Sequence[np.ndarray], expected: float | None) -> list[str]:
+def doubts(series: Sequence[np.ndarray], expected: float | None, robust: bool = False) -> list[str]:
     """Why intervals that take residuals as independent normal noise should not be believed; empty if they may be.
 
     Args:
         series: residuals in standard deviations, one array a component of a column, in order of time.
         expected: mean square that they should have; None if the noise was estimated from them.
+        robust: whether the loss minds the tails less already.
     """
     out = []
     if (p := whiteness(series)) < RARE:
         out.append(f"residuals follow each other (p = {p:.1g}): the model misses something, intervals are too narrow")
     joined = np.concatenate([r[np.isfinite(r)] for r in series])
-    if (p := normality(joined)) < RARE:
+    if not robust and (p := normality(joined)) < RARE:
         out.append(f"residuals are not normal (p = {p:.1g}): a robust loss, huber() or student(), minds the tails less")
     if expected is not None and len(joined) and (ratio := float(np.sqrt(np.mean(joined**2) / expected))) > 1.2:
         out.append(f"residuals are {ratio:.2g} times the noise that was given")

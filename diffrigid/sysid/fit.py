@@ -17,6 +17,7 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import split
 from diffrigid.sysid.records import check_mapping
+from diffrigid.sysid.remarks import remarks_on
 from diffrigid.sysid.result import Fit, describe
 from diffrigid.sysid.setup import (
     LEAST,
@@ -174,10 +175,9 @@ def finish(
     uncertainty = intervals(linear)
     scenes = tuple(fitted_scenes(problem, shared, own))
     residuals = tuple(by_column(problem, point, best))
-    parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals)
+    remarks += remarks_on(problem, scenes, by_column(problem, point, best, in_units=True))
+    parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
     order, alike = np.argsort(costs), costs <= costs[best] + ALIKE[0] + ALIKE[1] * costs[best]
-    if np.isfinite(problem.window):
-        remarks = [*remarks, f"only the first {problem.window:g} s of each record are fitted"]
     summary = Summary(
         parameters=parameters, noise=_all_noise(problem), costs=costs[order],
         orders=impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum())),
@@ -186,7 +186,7 @@ def finish(
     )  # fmt: skip
     return Fit(
         summary, problem, scenes, shared, own, linear, uncertainty, residuals,
-        np.asarray(point.z.shared, float)[:, order], loss,
+        np.asarray(point.z.shared, float)[:, order], loss, tuple(remarks),
     )  # fmt: skip
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 
 from diffrigid import paths
-from diffrigid.convert import nearest
 from diffrigid.state import State
 from diffrigid.sysid.free import Chart, Each, Free, Kind, Prior
 from diffrigid.sysid.sensors import Channel, channel_paths, read_channel, write_channel
@@ -119,6 +118,9 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
         slot = Slot(" = ".join(names), names, kind, 0, known)
         shape = reference(slot, having[0]).shape
         size = kind.size(shape)
+        whole = paths.component(names[0])[0]
+        if isinstance(kind, Free) and whole.endswith(".inertia") and having[0].world.dim == 3:
+            raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
         for scene in having:
             kind.check(f"free[{key!r}]", np.asarray(reference(slot, scene)))
         if known is not None and len(known.mean) not in (1, int(np.prod(shape))):
@@ -164,5 +166,5 @@ def _refuse(names: tuple[str, ...], having: Sequence[Scene], scenes: Sequence[Sc
         if lacking:
             catalogue = [*channel_paths(lacking[0].channels), *paths.catalogue(lacking[0].world)]
             where = "this world" if not having else "the scene of every record, as a parameter of `each` has to be"
-            raise ValueError(f"free: no parameter {name!r} in {where}: {nearest(name, catalogue)}")
+            raise ValueError(f"free: no parameter {name!r} in {where}: {paths.hint(lacking[0].world, name, catalogue)}")
     raise ValueError(f"free: no scene has all of {names}: tie only what is in one scene")

@@ -134,10 +134,11 @@ def known(run: Run, name: str) -> np.ndarray:
     return np.repeat(finite.all(1, keepdims=True), 1 if finite.shape[1] == 2 else 3, axis=1)
 
 
-def circular(run: Run, name: str) -> bool:
-    """True for columns of angles."""
-    observer = run.channels[name].observer
-    return isinstance(observer, Part) and observer.field == "angle"
+def full_turn(run: Run, name: str) -> float:
+    """What a column of angles reads after a full turn more; 0 for other columns."""
+    channel = run.channels[name]
+    is_angle = isinstance(channel.observer, Part) and channel.observer.field == "angle"
+    return 2.0 * np.pi * abs(float(channel.scale)) if is_angle else 0.0
 
 
 def _padded(array: np.ndarray, rows: int) -> np.ndarray:

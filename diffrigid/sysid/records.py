@@ -206,8 +206,13 @@ def _table(observations: Any, where: str) -> dict[str, Any]:
 
 def _times(t: Any, where: str) -> np.ndarray:
     t = _floats(t, where)
-    if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all():
-        raise ValueError(f"{where}: expected at least two increasing times, without NaN")
+    if t.ndim != 1 or len(t) < 2:
+        raise ValueError(f"{where} has shape {t.shape}: expected at least two increasing times")
+    if len(bad := np.flatnonzero(~(np.diff(t) > 0))):
+        k = int(bad[0])
+        raise ValueError(
+            f"{where}: expected increasing times without NaN, got {t[k]:g}, then {t[k + 1]:g} in row {k + 1}"
+        )
     return t
 
 
@@ -308,10 +313,14 @@ def _median_size(vectors: np.ndarray) -> float:
     return float(np.median(np.sqrt((complete**2).sum(1)))) if len(complete) else 0.0
 
 
-def noise_guess(values: np.ndarray, circular: bool) -> float:
-    """Standard deviation of the noise of a column (K, size) from second differences, which smooth motion hardly has."""
+def noise_guess(values: np.ndarray, turn: float) -> float:
+    """Standard deviation of the noise of a column (K, size) from second differences, which smooth motion hardly has.
+
+    Args:
+        turn: after which values are the same again; 0: never.
+    """
     first = np.diff(values, axis=0)
-    first = np.arctan2(np.sin(first), np.cos(first)) if circular else first
+    first = first - turn * np.round(first / turn) if turn else first
     second = np.abs(np.diff(first, axis=0))
     second = second[np.isfinite(second)]
     if second.size == 0:

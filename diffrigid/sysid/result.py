@@ -16,6 +16,7 @@ from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covar
 from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import best_by_record, levenberg
+from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene, Slot, reference
 from diffrigid.sysid.records import SAME, runs, same_data
@@ -60,6 +61,7 @@ class Fit:
     residuals: tuple[dict[str, np.ndarray], ...]  # of each record by column, (K, size), in standard deviations
     starts: np.ndarray  # (a, starts) z of the shared numbers where every start ended, the best first, as `costs`
     loss: Any
+    remarks: tuple[str, ...] = ()  # those of `notes` that do not depend on the intervals
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -164,8 +166,9 @@ class Fit:
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
         uncertainty = intervals(self.linear)
-        parameters, notes = describe(self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals)
-        summary = replace(self.summary, parameters=parameters, notes=notes)
+        of = self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.loss
+        parameters, notes = describe(*of)
+        summary = replace(self.summary, parameters=parameters, notes=(*self.remarks, *notes))
         return replace(self, summary=summary, uncertainty=uncertainty)
 
     def save(self, path: str | Path) -> Path:
@@ -197,7 +200,7 @@ class Fit:
 
 def describe(
     problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
-    residuals: tuple[dict[str, np.ndarray], ...],
+    residuals: tuple[dict[str, np.ndarray], ...], loss: Any,
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """The parameters with intervals, and the notes under the table."""
     places = coordinates((*problem.shared, *problem.own), references(problem))
@@ -210,6 +213,10 @@ def describe(
     ]
     if problem.own:
         blocks = [own_covariance(linear, k, uncertainty.covariance) for k in range(len(problem.runs))]
+        unseen = [np.flatnonzero(b.direction[linear.shared :]) for b in blind]
+        for block in blocks:
+            for rows in unseen:
+                block[rows, rows] = np.inf
         parameters += _own_parameters(problem, own, blocks, quantile, blind)
     notes = [b.words for b in blind]
     notes += weak(covariance, places[: linear.shared])
@@ -219,7 +226,7 @@ def describe(
     given = all(name in run.noise for run in problem.runs for name in run.channels)
     lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
     count = sum(map(len, linear.rows))
-    notes += doubts(series, max(1.0 - lost / count, 0.05) if given else None)
+    notes += doubts(series, max(1.0 - lost / count, 0.05) if given else None, not isinstance(loss, Squares))
     return tuple(parameters), tuple(notes)
 
 

@@ -154,13 +154,15 @@ def predict(channel: Channel, states: State) -> Array:
 
 
 def difference(channel: Channel, states: State, measured: Array) -> Array:
-    """Predicted minus measured, (K, size of the residual, *batch); angles and turns in rad, at most half a turn."""
+    """Predicted minus measured, (K, size of the residual, *batch); of angles and turns at most half a turn."""
     if _is_turn(channel):
         so, q = rotations(states.x.shape[2]), states.q[:, channel.observer.body]
         return jax.vmap(lambda measured, q: so.log(so.difference(measured, q)))(measured + jnp.zeros_like(q), q)
     away = predict(channel, states) - measured
-    is_angle = isinstance(channel.observer, Part) and channel.observer.field == "angle"
-    return jnp.arctan2(jnp.sin(away), jnp.cos(away)) if is_angle else away
+    if isinstance(channel.observer, Part) and channel.observer.field == "angle":
+        turn = away / channel.scale[None, None]
+        away = channel.scale[None, None] * jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
+    return away
 
 
 def _is_turn(channel: Channel) -> bool:

@@ -23,7 +23,7 @@ from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, Point
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
-from diffrigid.sysid.problem import Group, circular, evaluate, known, linearise, make_groups
+from diffrigid.sysid.problem import Group, evaluate, full_turn, known, linearise, make_groups
 from diffrigid.sysid.records import Run, noise_guess, runs
 from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
@@ -148,7 +148,7 @@ def _noise_guesses(found: Sequence[Run]) -> dict[str, float]:
     for run in found:
         for series in run.series:
             if series.name not in run.noise and np.isfinite(series.values).any():
-                guesses.setdefault(series.name, []).append(noise_guess(series.values, circular(run, series.name)))
+                guesses.setdefault(series.name, []).append(noise_guess(series.values, full_turn(run, series.name)))
     return {name: float(np.median(values)) for name, values in guesses.items()}
 
 

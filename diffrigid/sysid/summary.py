@@ -2,7 +2,7 @@
 
 import json
 import platform
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.paths import component
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.table import html_table, text_table
 
@@ -43,9 +44,18 @@ class Summary:
     versions: dict[str, str]
 
     def __getitem__(self, name: str) -> Parameter:
+        """A parameter by its path, a component by "ball.v[0]", or one of several paths that were fitted together."""
         for parameter in self.parameters:
             if parameter.name == name:
                 return parameter
+        whole, index = component(name)
+        for p in self.parameters:
+            if p.name == whole and index is not None and p.value.ndim > bool(p.records) and index < p.value.shape[-1]:
+                return _part(p, name, index)
+            if name in (parts := p.name.split(" : ")) and len(parts) > 1:
+                return _part(p, name, parts.index(name))
+            if name in p.name.split(" = "):
+                return replace(p, name=name)
         raise KeyError(f"no parameter {name!r}; there are {[p.name for p in self.parameters]}")
 
     def __repr__(self) -> str:
@@ -58,6 +68,11 @@ class Summary:
         """Write a JSON file, which `load_fit` reads; numbers that are not finite as "inf" and "nan"."""
         Path(path).write_text(json.dumps(_plain(asdict(self)), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         return Path(path)
+
+
+def _part(p: Parameter, name: str, index: int) -> Parameter:
+    """A component of a vector."""
+    return replace(p, name=name, value=p.value[..., index], low=p.low[..., index], high=p.high[..., index])
 
 
 def _plain(data: Any) -> Any:

@@ -59,7 +59,9 @@ def _others(fit: Any) -> str:
     finite = others[np.isfinite(others)]
     texts = []
     if len(finite):
-        texts.append(f"{len(finite)} ended at {finite[0] / max(fit.costs[0], 1e-300):.3g} times its cost or more")
+        texts.append(
+            f"{len(finite)} ended elsewhere, at a cost of {finite[0]:.4g} or more, the best at {fit.costs[0]:.4g}"
+        )
     if len(finite) < len(others):
         texts.append(f"{len(others) - len(finite)} diverged")
     return f" ({', '.join(texts)})" if texts else ""

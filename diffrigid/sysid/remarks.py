@@ -1,0 +1,71 @@
+"""What a fit says of its result as a whole, before it says how sure its numbers are."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from diffrigid.constraints import joint_errors, placed
+from diffrigid.state import rotations
+from diffrigid.sysid.diagnosis import RARE, whiteness
+from diffrigid.sysid.parameters import Scene
+from diffrigid.sysid.problem import full_turn
+from diffrigid.sysid.records import Run
+from diffrigid.sysid.setup import Problem
+
+AS_LARGE = 0.5  # [-] of the spread of a column: residuals from which on, if they follow each other, nothing is fitted
+TORN = 1e-3  # [m or rad] by which a joint may be off at the fitted start
+
+
+def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[dict[str, np.ndarray]]) -> list[str]:
+    """Remarks on a fit, the worst first.
+
+    Args:
+        scenes: fitted, of every record.
+        residuals: of every record by column, (K, size), in units of the column, NaN where missing.
+    """
+    names = [
+        series.name
+        for run, record in zip(problem.runs, residuals, strict=True)
+        for series in run.series
+        if _is_lost(run, series.name, series.values, record[series.name][: len(series.t)])
+    ]
+    out = []
+    if names:
+        out.append(
+            f"this is no fit: residuals of {', '.join(dict.fromkeys(names))} are as large as the motion; look at units "
+            "(m, s, rad) and at the values to begin with, or try more starts"
+        )
+    out += [text for scene in scenes[:1] for text in _torn(scene)]
+    if np.isfinite(problem.window):
+        out.append(f"only the first {problem.window:g} s of each record are fitted")
+    return out
+
+
+def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray) -> bool:
+    """Whether residuals are as large as what was seen varies, and are not noise."""
+    values = values[np.isfinite(values).all(1)]
+    if len(values) < 3:
+        return False
+    turn = full_turn(run, name)
+    values = np.unwrap(values, axis=0, period=turn) if turn else values
+    spread = np.sqrt(((values - values.mean(0)) ** 2).sum(1).mean())
+    size = np.sqrt(np.nanmean(np.nansum(residuals**2, axis=1)))
+    turns = 2.0 if residuals.shape[1] != values.shape[1] else 1.0  # a turn is twice the change of a unit quaternion
+    return bool(size > AS_LARGE * turns * spread) and whiteness(list(residuals.T)) < RARE
+
+
+def _torn(scene: Scene) -> list[str]:
+    """Joints that the bodies at the fitted start are off, which the first step puts right at once."""
+    world, state = scene.world, scene.state
+    if not world.joints:
+        return []
+    x, q = jnp.asarray(state.x), jnp.asarray(state.q)
+    errors = np.asarray(joint_errors(rotations(world.dim), placed(world.joints, world.statics, x, q)))
+    names = [name for group in world.joint_names for name in group]
+    return [
+        f"the fitted start is {size:.2g} m (or rad) off the joint {name}, onto which the first step moves the bodies: "
+        "free what moves with it too, a position with an angle, anchor_b with anchor_a"
+        for name, size in zip(names, np.abs(errors).max(1), strict=True)
+        if size > TORN
+    ]
