@@ -25,6 +25,10 @@ restitution = { interval = [0, 1] }
 tip = { marker = { body = "ball", point = [0.1, 0.0] } }
 pixels = { homography = { of = "ball", matrix = [[...], [...], [...]] } }
 
+[columns]                                   # columns of the files, where they have other names or units; no others
+t = { time = 0.001 }                        # "time" in ms
+"ball.x[0]" = "X"
+
 [fit]                                       # further arguments of `fit`
 starts = 8
 loss = "huber"
@@ -46,7 +50,7 @@ from diffrigid.scene import Body, Static, scene
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
 
-TABLES = ("bodies", "statics", "forces", "joints", "free", "observe", "fit")
+TABLES = ("bodies", "statics", "forces", "joints", "free", "observe", "columns", "fit")
 ARGUMENTS = ("gravity", *COEFFICIENTS, "ignore", "contact")
 OPTIONS = ("starts", "dt", "noise", "widths", "windows", "iterations", "seed", "loss")
 KINDS: dict[str, Callable] = {
@@ -72,6 +76,7 @@ class SceneFile:
     state: State
     free: dict[Any, Any]
     observe: dict[str, Any]
+    columns: dict[str, tuple[str, float]]  # name in the files, and factor, of each column
     options: dict[str, Any]  # further arguments of `fit`
 
 
@@ -108,8 +113,18 @@ def read_scene(path: str | Path) -> SceneFile:
         state=state,
         free={_paths(key): _kind(f"{path}: free.{key}", entry) for key, entry in data.get("free", {}).items()},
         observe={k: _observer(f"{path}: observe.{k}", entry) for k, entry in data.get("observe", {}).items()},
+        columns={k: _column(f"{path}: columns.{k}", entry) for k, entry in data.get("columns", {}).items()},
         options=_options(f"{path}: fit", data.get("fit", {})),
     )
+
+
+def _column(where: str, entry: Any) -> tuple[str, float]:
+    """From "name", or { name = factor }."""
+    given = {entry: 1.0} if isinstance(entry, str) else entry
+    if not isinstance(given, Mapping) or [isinstance(factor, int | float) for factor in given.values()] != [True]:
+        raise ValueError(f"{where} is {entry!r}: expected the name of a column, or {{ name = factor }}")
+    ((name, factor),) = given.items()
+    return name, float(factor)
 
 
 def _body(where: str, kind: Any, entry: Any) -> Any:

@@ -1,12 +1,15 @@
 """`python -m diffrigid fit scene.toml data.csv [more.csv ...]`: a fit from files."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from diffrigid import scene_file
+from diffrigid.convert import nearest
 from diffrigid.scene_file import read_scene
 from diffrigid.sysid.fit import fit
+from diffrigid.sysid.records import read_csv
 from diffrigid.sysid.summary import load_fit
 
 
@@ -24,7 +27,8 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     try:
         read = read_scene(options.scene)
-        observations = options.data if len(options.data) > 1 else options.data[0]
+        records = [_record(path, read.columns) for path in options.data]
+        observations = records if len(records) > 1 else records[0]
         resume = None if options.resume is None else load_fit(options.resume)
         found = fit(
             read.world, read.state, observations, free=read.free, observe=read.observe, resume=resume, **read.options
@@ -38,3 +42,14 @@ def main(arguments: Sequence[str]) -> int:
         title = f"{Path(options.scene).stem}: {', '.join(Path(name).name for name in options.data)}"
         print(f"report: {found.report(options.report, title)}")
     return 0
+
+
+def _record(path: str, columns: Mapping[str, tuple[str, float]]) -> Any:
+    """A file, or those of its columns that are named, by their names here."""
+    if not columns:
+        return path
+    table = read_csv(path)
+    for ours, (theirs, _) in columns.items():
+        if theirs not in table:
+            raise ValueError(f"{path} has no column {theirs!r}, which is {ours!r} here: {nearest(theirs, table)}")
+    return {ours: factor * table[theirs] for ours, (theirs, factor) in columns.items()}

@@ -168,24 +168,26 @@ def columns(
 
 
 def read_csv(path: str | Path) -> dict[str, np.ndarray]:
-    """Columns of a file with one line of names; an empty cell is missing."""
+    """Columns of a file with one line of names; an empty cell is missing.
+
+    Between columns are commas, or semicolons or tabs where the names have these; numbers may then have decimal commas.
+    """
     try:
         with open(Path(path), newline="", encoding="utf-8-sig") as file:  # a number would be an open file
-            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+            lines = [line for line in file if line.strip() and not line.startswith("#")]
+        mark = next((mark for mark in ";\t" if lines and mark in lines[0]), ",")
+        rows = list(csv.reader(lines, delimiter=mark))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is no CSV file: {error}") from None
     if not rows:
         raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
     names, body = [name.strip() for name in rows[0]], rows[1:]
-    if len(names) == 1 and (other := next((mark for mark in ";\t" if mark in names[0]), None)):
-        raise ValueError(
-            f"{path} has {other!r} between its columns: expected commas, and points in numbers; give `fit` the table "
-            f"pandas.read_csv({str(path)!r}, sep={other!r}), with decimal=',' if numbers have commas"
-        )
     for number, row in enumerate(body, start=2):
         if len(row) != len(names):
             raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)} like the names")
     try:
+        if mark != ",":
+            body = [[cell.replace(",", ".") for cell in row] for row in body]
         cells = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in body])
     except ValueError as error:
         raise ValueError(f"{path}: {error}; expected numbers under one line of names, empty where missing") from None
