@@ -18,6 +18,7 @@ import numpy as np
 import diffrigid as dr
 
 jax.config.update("jax_enable_x64", True)
+plt.rcParams["svg.hashsalt"] = "first fit"  # the same file from the same data
 
 README = Path(__file__).parent.parent / "README.md"
 TRUTH = 0.75  # restitution
