@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -183,6 +184,17 @@ def test_a_change_that_two_numbers_share_is_written_out():
 def tumbling(inertia, q, w):
     body = {"die": dr.Body(None, mass=1.0, inertia=inertia, x=(0.0, 0.0, 0.0), q=q, w=w)}
     return dr.scene(body, forces=[dr.Torque(body="die", tau=(0.4, -0.3, 0.2))])
+
+
+def test_of_a_body_in_free_flight_only_ratios_of_the_inertia_are_seen():
+    body = {"die": dr.Body(None, mass=1.0, inertia=np.diag([0.2, 0.3, 0.25]), x=(0.0, 0.0, 0.0), w=(3.0, -1.0, 2.0))}
+    world, state = dr.scene(body)
+    t = np.arange(20) / 20
+    data = {"t": t, "die.q": np.asarray(dr.rollout(world, state, dt=1 / 20, times=t)["die.q"])}
+    words = dr.sysid.blind_spots(world, state, data, free={"die.inertia": dr.inertia(), "die.w": dr.real()})
+    assert words == ("only the ratios of die.inertia are seen: all times one factor is the same motion",)
+    with pytest.raises(ValueError, match=r"expected inertia\(\)"):
+        dr.sysid.blind_spots(world, state, data, free={"die.inertia": dr.real()})
 
 
 def test_inertia_and_orientation_of_a_tumbling_body():

@@ -219,6 +219,8 @@ def describe(
                 block[rows, rows] = np.inf
         parameters += _own_parameters(problem, own, blocks, quantile, blind)
     notes = [b.words for b in blind]
+    if uncertainty.freedom < linear.shared:
+        notes.append(f"{uncertainty.freedom:.0f} degrees of freedom for {linear.shared} intervals: fit more records")
     notes += weak(covariance, places[: linear.shared])
     notes += _together(uncertainty.covariance, places[: linear.shared], blind)
     series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]
