@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.numerics import dot, normalise, safe_sqrt
+from diffrigid.numerics import dot, normalise
 from diffrigid.pytree import Leaf, array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, material_point, material_velocity, rotations
 
@@ -123,7 +123,7 @@ class SpringDamper:
     """Spring and damper along the line between two points: F = -stiffness (l - length) - damping dl/dt.
 
     Anchors are in body axes, from the centre of mass; `b=None` ties to the world, and `anchor_b` is a world
-    point. Where the two points coincide the direction, and so the force, is taken as zero.
+    point. Where the two points coincide the line is that along which they part, and none where they rest.
 
     Example:
         >>> spring = dr.SpringDamper(a="ball", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=4 * np.pi**2)
@@ -148,10 +148,13 @@ class SpringDamper:
         so = rotations(bodies.dim)
         point_a, v_a = self._end(state, self.a, self.anchor_a)
         point_b, v_b = self._end(state, self.b, self.anchor_b)
-        span = point_a - point_b
-        along = normalise(span)
-        stretch = safe_sqrt(dot(span, span)) - self.length
-        F = -(self.stiffness * stretch + self.damping * dot(along, v_a - v_b))[None] * along
+        span, parting = point_a - point_b, v_a - v_b
+        apart = dot(span, span)[None] > 0
+        along = normalise(jnp.where(apart, span, parting))
+        # Vectors rather than a length times a direction, whose product has no derivative where both are 0.
+        stretch = span - self.length[None] * along
+        rate = jnp.where(apart, dot(along, parting)[None] * along, parting)
+        F = -self.stiffness[None] * stretch - self.damping[None] * rate
         F_all, tau_all = jnp.zeros_like(state.v), jnp.zeros_like(state.w)
         for body, point, sign in ((self.a, point_a, 1.0), (self.b, point_b, -1.0)):
             if body is not None:

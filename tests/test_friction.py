@@ -363,6 +363,29 @@ def test_a_block_slides_into_another(mode):
         assert_allclose(slopes[0][name], true_slope, atol=1e-6)  # both stop within a step
 
 
+def test_a_disc_slides_into_a_slope():
+    """Held by the floor until it strikes, at any time of the step: speed along the slope, and distance, in closed form."""
+    angle, v, r, dt = 0.4, 4.0, 0.1, 1 / 60
+    along = np.array([np.cos(angle), np.sin(angle)])
+
+    def end(gap):
+        bodies = {
+            "disc": dr.Body(dr.Disc(radius=r), mass=1.0, x=jnp.stack([-gap, r + 0.0 * gap]), v=(v, 0.0)),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+            "slope": dr.Static(dr.HalfSpace(normal=(-np.sin(angle), np.cos(angle)), offset=r * np.cos(angle) - r)),
+        }
+        world, state = dr.scene(bodies, gravity=(0.0, -9.81))
+        end = dr.step(world, state, dt)
+        return end.v[0] @ along, (end.x[0] - np.array([0.0, r])) @ along
+
+    gap = jnp.array([0.001, 0.0031, 0.01, 0.03, 0.06])
+    left = dt - gap / v
+    speed = v * np.cos(angle) - 9.81 * np.sin(angle) * left
+    found = jax.jit(jax.vmap(end))(gap)
+    assert_allclose(found[0], speed, atol=1e-8)
+    assert_allclose(found[1], 0.5 * (v * np.cos(angle) + speed) * left, atol=1e-10)
+
+
 def test_a_ball_that_rests_is_struck():
     """From above and aside, so that it hits the floor at once: slopes by aim, speed and law are those of differences."""
 

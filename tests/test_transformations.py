@@ -318,6 +318,29 @@ def test_spring_and_damper_oscillate():
     assert_fourth_order(error, 60, 1e-6)
 
 
+def test_a_spring_may_begin_without_length():
+    """From its anchor, at rest or not, r = v exp(-gamma t) sin(omega t) / omega in each direction, slopes too."""
+    m, k, c, t = 1.0, 20.0, 1.0, 0.5
+    gamma = c / (2 * m)
+    omega = np.sqrt(k / m - gamma**2)
+
+    def end(x, v):
+        body = dr.Body(None, mass=m, inertia=1.0, x=x, v=v)
+        spring = dr.SpringDamper(a="body", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=k, damping=c)
+        return dr.rollout(*dr.scene({"body": body}, forces=[spring]), dt=1 / 240, steps=120).state.x[-1, 0]
+
+    decay, sine = np.exp(-gamma * t), np.sin(omega * t) / omega
+    values = jax.jit(jax.vmap(lambda v: (end(jnp.zeros(2), v), jax.jacfwd(end, (0, 1))(jnp.zeros(2), v))))
+    v = jnp.array([[1.0, 0.0], [0.6, -0.8], [0.0, 0.0]])
+    x, (by_x, by_v) = values(v)
+    assert_allclose(x, decay * sine * v, atol=1e-8)
+    assert_allclose(by_v[:2], np.broadcast_to(decay * sine * np.eye(2), (2, 2, 2)), atol=1e-4)
+    by_place = decay * (np.cos(omega * t) + gamma * sine) * np.eye(2)
+    assert_allclose(by_v[2], decay * sine * np.eye(2), atol=1e-8)
+    assert_allclose(by_x[2], by_place, atol=1e-8)
+    assert_allclose(jax.jit(jax.jacrev(end))(jnp.zeros(2), v[2]), by_place, atol=1e-8)
+
+
 def test_spring_between_bodies_keeps_momentum():
     """Anchored off their centres, in space: forces opposite, torques about one point opposite."""
     rng = np.random.default_rng(0)

@@ -16,7 +16,9 @@ from diffrigid.contact.sides import at_colliders, body_sides
 from diffrigid.gathers import rows
 from diffrigid.pytree import array, pytree, replace
 
-SOON = 0.25  # power of the spacing of numbers, of a step: what is held no longer than this need not be
+# Of a step, by the spacing of numbers: what is held no longer than this need not be. In single precision a gap of
+# rounding may close as late as a fiftieth of a step after it should.
+SOON = 1e3, 2 / 3
 
 
 @pytree
@@ -134,7 +136,7 @@ def _of_clusters(
     member = label[None] == label[:, None]
     until, bounce, begins = (jnp.where(member, t[None], jnp.inf).min(1) for t in (first, first_bounce, t0))
     supported = (member & links.of_bodies(jnp.max, rests, False)[None]).any(1) & (until < jnp.inf)
-    waits = until - begins > jnp.finfo(dt.dtype).eps ** SOON * dt[None]
+    waits = until - begins > SOON[0] * jnp.finfo(dt.dtype).eps ** SOON[1] * dt[None]
     held, along = supported & waits, supported & ~waits & (until < bounce)
     return jnp.where(held, until, jnp.inf), jnp.where(along, until, jnp.inf)
 
