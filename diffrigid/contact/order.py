@@ -16,9 +16,9 @@ from diffrigid.contact.sides import at_colliders, body_sides
 from diffrigid.gathers import rows
 from diffrigid.pytree import array, pytree, replace
 
-# Of a step, by the spacing of numbers: what is held no longer than this need not be. In single precision a gap of
-# rounding may close as late as a fiftieth of a step after it should.
-SOON = 1e3, 2 / 3
+# Power of the spacing of numbers, of a step: what is held no longer than this need not be. Else a gap of rounding, and in
+# double precision the error of the second time to which it is held, would take a sweep each.
+SOON = 0.25
 
 
 @pytree
@@ -136,7 +136,7 @@ def _of_clusters(
     member = label[None] == label[:, None]
     until, bounce, begins = (jnp.where(member, t[None], jnp.inf).min(1) for t in (first, first_bounce, t0))
     supported = (member & links.of_bodies(jnp.max, rests, False)[None]).any(1) & (until < jnp.inf)
-    waits = until - begins > SOON[0] * jnp.finfo(dt.dtype).eps ** SOON[1] * dt[None]
+    waits = until - begins > jnp.finfo(dt.dtype).eps ** SOON * dt[None]
     held, along = supported & waits, supported & ~waits & (until < bounce)
     return jnp.where(held, until, jnp.inf), jnp.where(along, until, jnp.inf)
 
