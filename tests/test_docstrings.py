@@ -12,7 +12,7 @@ import numpy as np
 import diffrigid as dr
 
 PAGE = (Path(__file__).parent.parent / "notebooks" / "api.md").read_text()
-NAMES = re.findall(r"\.\. auto(?:function|class):: (\w+)", PAGE)
+NAMES = re.findall(r"^\.\. auto(?:function|class):: (\w+)$", PAGE, flags=re.M)  # of what one imports; not of results
 # What `dataclasses` and JAX describe, and what needs a crowd, in `tests/test_crowd.py`.
 ELSEWHERE = {"replace", "QUICK", "missed_pairs"}
 MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"} | {

@@ -16,8 +16,8 @@ from diffrigid.contact.sides import at_colliders, body_sides
 from diffrigid.gathers import rows
 from diffrigid.pytree import array, pytree, replace
 
-# Power of the spacing of numbers, of a step: what is held no longer than this need not be. Else a gap of rounding, or in
-# double precision the error of the second time to which it is held, would take a sweep.
+# Power of the spacing of numbers, of a step: what is held no longer than this need not be. Else a gap of rounding, or
+# in double precision the error of the second time to which it is held, would take a sweep.
 SOON = 0.25
 
 
