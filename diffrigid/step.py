@@ -64,9 +64,9 @@ def rollout(
     Args:
         dt: [s] length of a step, or with `times` the longest step allowed.
         steps: number of steps T >= 1; or
-        times: (T+1,) [s] increasing; times[0] is the time of `state`. Each interval is divided into equal steps
-            no longer than dt. Differentiable. Inside jit or vmap, give `substeps`, the number of steps of each
-            interval, because it has to be known when tracing.
+        times: (T+1,) [s] increasing; times[0] is the time of `state`. Each interval is divided into equal steps no
+            longer than dt (to a thousandth). Differentiable. Inside jit or vmap, give `substeps`, the number of steps
+            of each interval, because it has to be known when tracing.
         controls: values (T, D or A, *batch) that forces with a `control` add, by its name; held over each interval.
         memory: [bytes] that reverse mode may use for saved states. If the states of all T steps do not fit, only about
             sqrt(T) are kept, and the steps between them are computed again. If all that a step of one world finds out

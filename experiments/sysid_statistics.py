@@ -29,7 +29,8 @@ import diffrigid as dr
 from diffrigid.sysid.covariance import from_jacobian
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import squares
-from diffrigid.sysid.setup import first_numbers, linear_of, make_problem, make_starts
+from diffrigid.sysid.points import linear_of
+from diffrigid.sysid.setup import first_numbers, make_problem, make_starts
 
 MISSING = 0.1  # share of the numbers
 FLOOR = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))

@@ -4,9 +4,9 @@ To read it, in the order of a fit; `fit.py` runs it:
 
     what was measured     records.py, sensors.py, times.py
     what is free          free.py (kinds), parameters.py (where they are); losses.py
-    the problem           setup.py, problem.py (from z to residuals), clocks.py
+    the problem           setup.py, problem.py (from z to residuals), clocks.py, points.py (back)
     solvers               levenberg.py, gradient.py; segments.py for long records
-    how sure              covariance.py, profile.py, sampling.py, diagnosis.py, orders.py
+    how sure              covariance.py, profile.py, sampling.py, diagnosis.py, remarks.py, orders.py
     what comes out        result.py, summary.py, table.py, figures.py
     before measuring      design.py
 

@@ -13,9 +13,10 @@ from diffrigid.sysid.diagnosis import blind_directions, coordinates, infinite_wh
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Slot, make_slots, put, reference
+from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.records import Record
 from diffrigid.sysid.result import interval_of, references, unit_of
-from diffrigid.sysid.setup import Problem, first_numbers, linear_of, make_problem, make_starts, scene_of
+from diffrigid.sysid.setup import Problem, first_numbers, make_problem, make_starts, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.world import World
 

@@ -16,19 +16,17 @@ from diffrigid.sysid.levenberg import INTERRUPTED, Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import split
+from diffrigid.sysid.points import by_column, linear_of, row_mask
 from diffrigid.sysid.records import check_mapping
 from diffrigid.sysid.remarks import remarks_on
 from diffrigid.sysid.result import Fit, describe
 from diffrigid.sysid.setup import (
     LEAST,
     Problem,
-    by_column,
     fitted_scenes,
-    linear_of,
     make_problem,
     make_starts,
     reach_of,
-    row_mask,
     with_noise,
 )
 from diffrigid.sysid.summary import Summary, versions

@@ -19,10 +19,10 @@ from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene, Slot, reference
+from diffrigid.sysid.points import by_column
 from diffrigid.sysid.records import SAME, runs, same_data
 from diffrigid.sysid.setup import (
     Problem,
-    by_column,
     make_problem,
     make_starts,
     reach_of,

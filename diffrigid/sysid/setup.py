@@ -18,10 +18,8 @@ from diffrigid.devices import everywhere
 from diffrigid.paths import write as write_path
 from diffrigid.state import State
 from diffrigid.step import floats
-from diffrigid.sysid.covariance import Linear
 from diffrigid.sysid.free import Free
-from diffrigid.sysid.levenberg import Numbers, Point
-from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.levenberg import Numbers
 from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
 from diffrigid.sysid.problem import Group, evaluate, full_turn, known, linearise, make_groups
 from diffrigid.sysid.records import Run, noise_guess, runs
@@ -284,62 +282,3 @@ def fitted_scene(problem: Problem, group: Group, k: int, shared: np.ndarray, own
 
 
 _put = jax.jit(put, static_argnames="slots")
-
-
-# ---- a point as arrays of NumPy
-
-
-def linear_of(problem: Problem, point: Point, best: int, loss: Any, estimated: bool) -> Linear:
-    """Residuals and slopes of one start, record by record, without the rows that are missing."""
-    rows: list[Any] = [None] * len(problem.runs)
-    for group, r, jac in zip(problem.groups, point.residuals, point.jacobians, strict=True):
-        values, slopes = np.asarray(r, float)[..., best], np.asarray(jac, float)[..., best]
-        for k, member in enumerate(group.members):
-            use, t = row_mask(problem, group, k, len(values))
-            rows[member] = (values[use, k], slopes[use][..., k], t[use])
-    residuals, jacobians, times = zip(*rows, strict=True)
-    residuals, variance = _as_least_squares(loss, residuals, problem.sizes[0] + problem.sizes[1] * len(rows))
-    return Linear(residuals, jacobians, times, problem.sizes[0], variance, estimated)
-
-
-def _as_least_squares(loss: Any, residuals: tuple[np.ndarray, ...], numbers: int) -> tuple[Any, float]:
-    """Residuals that least squares would follow as the loss follows these, and their variance."""
-    if isinstance(loss, Squares):
-        return residuals, 1.0
-    joined = jnp.asarray(np.concatenate(residuals))
-    slope = jax.grad(lambda r: loss.rho(r).sum())
-    bend = float(jax.jvp(slope, (joined,), (jnp.ones_like(joined),))[1].mean())
-    parts = tuple(np.asarray(slope(jnp.asarray(r)), float) / max(bend, 0.05) for r in residuals)
-    variance = float(sum((part**2).sum() for part in parts) / max(len(joined) - numbers, 1))
-    return parts, variance
-
-
-def row_mask(problem: Problem, group: Group, k: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which rows of record k of a group are measured (or of a prior), and their times (m,)."""
-    use, times = [], []
-    for name, weights in group.data.weights.items():
-        w = np.asarray(weights)[..., k if weights.shape[-1] > 1 else 0]
-        t = np.zeros(len(w))
-        series = next(s for s in problem.runs[group.members[k]].series if s.name == name)
-        t[: len(series.t)] = series.t
-        use.append((w > 0).ravel())
-        times.append(np.repeat(t, w.shape[1]))
-    used, t = np.concatenate(use), np.concatenate(times)
-    priors = rows - len(used)
-    return np.concatenate([used, np.ones(priors, bool)]), np.concatenate([t, np.full(priors, np.nan)])
-
-
-def by_column(problem: Problem, point: Point, best: int, in_units: bool = False) -> list[dict[str, np.ndarray]]:
-    """Residuals of every record, by column, (K, size), NaN where missing; in standard deviations, or `in_units`."""
-    out: list[Any] = [None] * len(problem.runs)
-    for group, r in zip(problem.groups, point.residuals, strict=True):
-        values = np.asarray(r, float)[..., best]
-        for k, member in enumerate(group.members):
-            first, found = 0, {}
-            for name, weights in group.data.weights.items():
-                w = np.asarray(weights)[..., k if weights.shape[-1] > 1 else 0]
-                piece = values[first : first + w.size, k].reshape(w.shape)
-                found[name] = np.where(w > 0, piece / (np.where(w > 0, w, 1.0) if in_units else 1.0), np.nan)
-                first += w.size
-            out[member] = found
-    return out
