@@ -182,7 +182,7 @@ def drop_table(fit: dr.Fit) -> list[tuple[str, ...]]:
         row("square: restitution", numbers("restitution"), "-", "0.47 (middle half of impacts: 0.43 to 0.51)"),
         row("square: friction", numbers("friction"), "-", "at most 0.14 (95 % of |Pt / Pn|)"),
         row("square: radius of gyration", gyration, "mm", "24.5 (uniform square)"),
-        row("square: height of the floor", floor, "mm", "1.75 (under squares at rest)"),
+        row("square: height of the floor", floor, "mm", "1.75 (under squares at rest; a round corner: see the report)"),
     ]
 
 
