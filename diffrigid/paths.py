@@ -77,6 +77,8 @@ def read(world: World, state: State, path: str) -> Array:
 def write(world: World, state: State, path: str, value: Any) -> tuple[World, State]:
     """World and state with a parameter changed; everything else shared. Works on traced values.
 
+    They are taken as they are: a normal, an axis or a quaternion has to have length one.
+
     Raises:
         ValueError: there is no such parameter, or the value has another shape. Coefficients without the name of a
             body take a number for all.

@@ -14,6 +14,7 @@ from jax import Array, lax
 from diffrigid.branches import opaque_true
 from diffrigid.compiling import QUICK, is_own_program, uncollected
 from diffrigid.contact.crowd import without_room
+from diffrigid.contact.strikes import ends, is_rolling
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, largest, numbers
 from diffrigid.flight import Flight, launch
@@ -204,7 +205,10 @@ def advance(world: World, state: State, dt: Array, controls: Any) -> State:
 
 
 def aligned(world: World, state: State) -> tuple[World, State]:
-    """World and state with the same number of batch axes, and the state with all of the batch."""
+    """World and state with the same number of batch axes, and the state with all of the batch.
+
+    So is the world where rows of joints, or of friction against rolling, stand beside contacts in one list.
+    """
     rank = max(batch_rank(world), batch_rank(state))
     world, state = align(world, rank), align(state, rank)
     batches = [leaf.shape[leaf.ndim - rank :] for leaf in jax.tree.leaves((world, state))]
@@ -213,7 +217,8 @@ def aligned(world: World, state: State) -> tuple[World, State]:
     def fill(leaf: Array) -> Array:
         return jnp.broadcast_to(leaf, leaf.shape[: leaf.ndim - rank] + batch)
 
-    return world, jax.tree.map(fill, state)
+    rows = (world.joints and ends(world)["a"]) or is_rolling(world)
+    return jax.tree.map(fill, world) if rows else world, jax.tree.map(fill, state)
 
 
 @jax.jit

@@ -124,3 +124,31 @@ def test_controls_of_a_batch_are_those_of_each_world():
     assert_allclose(run.v[:, -1, 0], [[3.0, 0.0], [0.0, 6.0]], atol=1e-12)
     with pytest.raises(ValueError, match=r"shape \(3, 2, 2\): expected \(3, 2\) or \(2, 3, 2\)"):
         dr.rollout_batch(world, states, dt=1.0, steps=3, controls={"push": np.zeros((3, 2, 2))})
+
+
+def hinged_and_rolling():
+    """An arm that falls onto its stop, and a disc that rolls on a floor."""
+    bodies = {
+        "arm": dr.Body(None, mass=0.5, inertia=0.02, x=(1.0, 0.8)),
+        "disc": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 0.1), v=(1.0, 0.0)),
+        "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+    }
+    hinge = dr.Revolute("arm", anchor_a=(-0.3, 0.0), upper=0.4, lower=-0.02, friction=0.01)
+    return dr.scene(bodies, gravity=(0.0, -9.81), friction=0.3, rolling_friction=0.01, joints={"hinge": hinge})
+
+
+def test_any_leaf_may_be_batched_where_joints_and_contacts_meet():
+    """Some of them, each by itself, by shapes; and values, with the velocities of three worlds."""
+    world, state = hinged_and_rolling()
+    leaves, tree = jax.tree.flatten((world, state))
+    for k, leaf in list(enumerate(leaves))[::4]:
+        batched = jax.tree.unflatten(
+            tree, [jnp.stack([leaf] * 3) if i == k else other for i, other in enumerate(leaves)]
+        )
+        ends = jax.eval_shape(lambda pair: dr.rollout_batch(*pair, dt=1 / 60, steps=2, final_only=True), batched)
+        assert ends.x.shape == (3, 2, 2)
+    v = state.v[None] * jnp.array([0.5, 1.0, 2.0])[:, None, None]
+    ends = dr.rollout_batch(world, dr.replace(state, v=v), dt=1 / 60, steps=20, final_only=True)
+    one = dr.rollout(world, dr.replace(state, v=v[2]), dt=1 / 60, steps=20).state
+    jax.tree.map(lambda a, b: assert_allclose(a[2], b[-1], rtol=1e-10, atol=1e-12), ends, one)
+    assert abs(one.v[-1, 1, 0] - 2.0) > 0.1 and abs(one.w[10, 0, 0] - one.w[2, 0, 0]) > 1e-3
