@@ -155,7 +155,8 @@ def _covariance(problem: Problem, record: int, linear: Linear) -> np.ndarray:
     """Of the shared numbers, infinite where a record does not see them."""
     slots, scene = (*problem.shared, *problem.own), scene_of(problem.runs[record])
     places = coordinates(slots, [np.asarray(reference(slot, scene)) for slot in slots])
-    return infinite_where_blind(from_jacobian(linear).covariance, blind_directions(linear, places), linear.shared)
+    shared = slice(0, linear.shared)
+    return infinite_where_blind(from_jacobian(linear).covariance, blind_directions(linear, places), shared)
 
 
 def _score(covariance: np.ndarray) -> float:

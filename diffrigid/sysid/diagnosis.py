@@ -198,11 +198,11 @@ def doubts(series: Sequence[np.ndarray], expected: float | None, robust: bool = 
     return out
 
 
-def infinite_where_blind(covariance: np.ndarray, blind: Sequence[Blind], shared: int) -> np.ndarray:
-    """Covariance with infinite variance for shared numbers that take part in a direction that is not seen."""
-    parts = np.zeros(shared, bool)
+def infinite_where_blind(covariance: np.ndarray, blind: Sequence[Blind], numbers: slice) -> np.ndarray:
+    """Covariance of some numbers of z, with infinite variance for those of a direction that is not seen."""
+    parts = np.zeros(len(covariance), bool)
     for b in blind:
-        parts |= b.direction[:shared] != 0
+        parts |= b.direction[numbers] != 0
     covariance = covariance.copy()
     covariance[parts, parts] = np.inf
     return covariance

@@ -61,7 +61,7 @@ class Fit:
     residuals: tuple[dict[str, np.ndarray], ...]  # of each record by column, (K, size), in standard deviations
     starts: np.ndarray  # (a, starts) z of the shared numbers where every start ended, the best first, as `costs`
     loss: Any
-    remarks: tuple[str, ...] = ()  # those of `notes` that do not depend on the intervals
+    remarks: tuple[str, ...]  # those of `notes` that do not depend on the intervals
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -166,8 +166,9 @@ class Fit:
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
         uncertainty = intervals(self.linear)
-        of = self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.loss
-        parameters, notes = describe(*of)
+        parameters, notes = describe(
+            self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.loss
+        )
         summary = replace(self.summary, parameters=parameters, notes=(*self.remarks, *notes))
         return replace(self, summary=summary, uncertainty=uncertainty)
 
@@ -206,17 +207,14 @@ def describe(
     places = coordinates((*problem.shared, *problem.own), references(problem))
     blind = blind_directions(linear, places)
     quantile = student_quantile(uncertainty.freedom)
-    covariance = infinite_where_blind(uncertainty.covariance, blind, linear.shared)
+    covariance = infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared))
     parameters = [
         _shared_parameter(problem, slot, z, block, quantile, blind)
         for slot, z, block in _pieces(problem.shared, shared, covariance)
     ]
     if problem.own:
         blocks = [own_covariance(linear, k, uncertainty.covariance) for k in range(len(problem.runs))]
-        unseen = [np.flatnonzero(b.direction[linear.shared :]) for b in blind]
-        for block in blocks:
-            for rows in unseen:
-                block[rows, rows] = np.inf
+        blocks = [infinite_where_blind(block, blind, slice(linear.shared, None)) for block in blocks]
         parameters += _own_parameters(problem, own, blocks, quantile, blind)
     notes = [b.words for b in blind]
     if uncertainty.freedom < linear.shared:
