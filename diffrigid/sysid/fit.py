@@ -173,7 +173,7 @@ def finish(
     uncertainty = intervals(linear)
     scenes = tuple(fitted_scenes(problem, shared, own))
     residuals = tuple(by_column(problem, point, best))
-    remarks += remarks_on(problem, scenes, by_column(problem, point, best, in_units=True))
+    remarks = [*remarks, *remarks_on(problem, scenes, by_column(problem, point, best, in_units=True))]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
     order, alike = np.argsort(costs), costs <= costs[best] + ALIKE[0] + ALIKE[1] * costs[best]
     summary = Summary(

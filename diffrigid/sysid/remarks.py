@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.constraints import joint_errors, placed
@@ -36,7 +35,7 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
             f"this is no fit: residuals of {', '.join(dict.fromkeys(names))} are as large as the motion; look at units "
             "(m, s, rad) and at the values to begin with, or try more starts"
         )
-    out += [text for scene in scenes[:1] for text in _torn(scene)]
+    out += _torn(scenes[0])
     if np.isfinite(problem.window):
         out.append(f"only the first {problem.window:g} s of each record are fitted")
     return out
@@ -44,15 +43,12 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
 
 def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray) -> bool:
     """Whether residuals are as large as what was seen varies, and are not noise."""
-    values = values[np.isfinite(values).all(1)]
-    if len(values) < 3:
-        return False
-    turn = full_turn(run, name)
-    values = np.unwrap(values, axis=0, period=turn) if turn else values
-    spread = np.sqrt(((values - values.mean(0)) ** 2).sum(1).mean())
-    size = np.sqrt(np.nanmean(np.nansum(residuals**2, axis=1)))
-    turns = 2.0 if residuals.shape[1] != values.shape[1] else 1.0  # a turn is twice the change of a unit quaternion
-    return bool(size > AS_LARGE * turns * spread) and whiteness(list(residuals.T)) < RARE
+    residuals, values = (part[:, np.isfinite(part).any(0)] for part in (residuals, values))
+    if turn := full_turn(run, name):
+        values = np.unwrap(values[np.isfinite(values).all(1)], axis=0, period=turn)
+    spread, size = (np.sqrt(part.sum()) for part in (np.nanvar(values, axis=0), np.nanmean(residuals**2, axis=0)))
+    turned = residuals.shape[1] != values.shape[1]  # by twice the change of a unit quaternion
+    return bool(size > AS_LARGE * spread * (1.0 + turned)) and whiteness(list(residuals.T)) < RARE
 
 
 def _torn(scene: Scene) -> list[str]:
@@ -60,8 +56,7 @@ def _torn(scene: Scene) -> list[str]:
     world, state = scene.world, scene.state
     if not world.joints:
         return []
-    x, q = jnp.asarray(state.x), jnp.asarray(state.q)
-    errors = np.asarray(joint_errors(rotations(world.dim), placed(world.joints, world.statics, x, q)))
+    errors = np.asarray(joint_errors(rotations(world.dim), placed(world.joints, world.statics, state.x, state.q)))
     names = [name for group in world.joint_names for name in group]
     return [
         f"the fitted start is {size:.2g} m (or rad) off the joint {name}, onto which the first step moves the bodies: "

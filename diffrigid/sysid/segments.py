@@ -109,8 +109,9 @@ def fit_in_pieces(
     first = fit(world, state, pieces, free=shared | _own_states(world, observations), starts=starts, **options)
     ends = [run.start - first.problem.runs[0].start for run in first.problem.runs[2::2]]
     whole = fit(world, state, observations, free=free, windows=(*ends, np.inf), resume=first, **options)
-    notes = (_apart(first, count), *_lost(first, whole), *whole.notes)
-    return replace(whole, summary=replace(whole.summary, notes=notes))
+    remarks = (_apart(first, count), *_lost(first, whole))
+    summary = replace(whole.summary, notes=(*remarks, *whole.notes))
+    return replace(whole, summary=summary, remarks=(*remarks, *whole.remarks))
 
 
 def jumps(fit: Fit) -> dict[str, np.ndarray]:
