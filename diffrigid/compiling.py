@@ -55,9 +55,9 @@ def compile_for_speed() -> None:
     """Have JAX compile for speed on a CPU, from here on in this process; call it before anything else uses JAX.
 
     A loop, and so a rollout, is then one function, where XLA makes one of every few operations: two to eight times as
-    fast for a single world, 1.5 to 4 times for a batch. Compiling takes about as long as JAX by itself needs in
-    2D, and 1.6 times (a rollout) to three times (a gradient) as long in 3D. A fit, most of whose time is that of
-    compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
+    fast for a single world, 1.5 to 4 times for a batch. Compiling takes about as long as JAX by itself needs in 2D, and
+    1.6 times (a rollout) to three times (a gradient) as long in 3D. A fit, most of whose time is that of compiling, is
+    better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
 
     Raises:
         RuntimeError: JAX was in use already, so that it did not read XLA_FLAGS.

@@ -123,7 +123,8 @@ class SpringDamper:
     """Spring and damper along the line between two points: F = -stiffness (l - length) - damping dl/dt.
 
     Anchors are in body axes, from the centre of mass; `b=None` ties to the world, and `anchor_b` is a world
-    point. Where the two points coincide the line is that along which they part, and none where they rest.
+    point. Where the two points coincide the line is that along which they part, and none where they rest: the force is
+    differentiable there if `length` is 0, and kinked else.
 
     Example:
         >>> spring = dr.SpringDamper(a="ball", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=4 * np.pi**2)

@@ -158,7 +158,7 @@ def _made(where: str, kind: Callable, fields: Any) -> Any:
 
 
 def _paths(key: str) -> str | tuple[str, ...]:
-    names = tuple(part.strip() for part in re.split("[=:]", key))
+    names = tuple(part.strip() for part in re.split(r"=|\s:\s", key))
     return names if len(names) > 1 else names[0]
 
 

@@ -175,8 +175,7 @@ def _joint(link: Link, frames: dict[str, Frame], skipped: list[str]) -> Any:
     if joint.kind in ("ball", "weld"):
         return (joints.Ball if joint.kind == "ball" else joints.Weld)(**ends)
     drive: dict[str, Any] = {name: value for name in ("damping", "friction") if (value := getattr(joint, name)) > 0}
-    limits = {"lower": joint.lower, "upper": joint.upper}
-    limits = {side: value for side, value in limits.items() if value is not None}
+    limits = {side: value for side in ("lower", "upper") if (value := getattr(joint, side)) is not None}
     if joint.kind == "hinge" and limits and not _are_told_apart(**limits):
         texts = " and ".join(f"{side} limit {value:g} rad" for side, value in limits.items())
         skipped.append(f"{texts} of {joint.name or link.name}, which is known up to full turns")

@@ -7,7 +7,6 @@ from typing import Any
 
 from diffrigid import scene_file
 from diffrigid.convert import nearest
-from diffrigid.scene_file import read_scene
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.records import read_csv
 from diffrigid.sysid.summary import load_fit
@@ -26,7 +25,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--resume", metavar="FILE", help="start from a result")
     options = parser.parse_args(arguments)
     try:
-        read = read_scene(options.scene)
+        read = scene_file.read_scene(options.scene)
         records = [_record(path, read.columns) for path in options.data]
         observations = records if len(records) > 1 else records[0]
         resume = None if options.resume is None else load_fit(options.resume)
