@@ -1,6 +1,7 @@
 """What `compile_for_speed` makes of a rollout, in a process of its own."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,7 @@ def test_too_late_is_an_error(monkeypatch):
     jax.devices()
     with pytest.raises(RuntimeError, match="compile_for_speed: JAX was in use before"):
         dr.compile_for_speed()
+    assert os.environ["XLA_FLAGS"] == ""  # else chunks were those of another program
 
 
 def test_what_is_a_program_of_its_own():

@@ -76,6 +76,12 @@ def test_derivatives_of_a_crowd_and_of_a_batch(many):
     assert_allclose(slope, (there - back) / (2 * h), rtol=1e-4)  # impacts magnify what is of second order in h
 
 
+def test_a_fit_of_a_crowd_takes_steps_as_of_other_bodies_that_touch(many):
+    world, state = box(20)
+    data = {"t": np.arange(3) / 10, "d0.x": np.zeros((3, 2))}
+    assert dr.sysid.make_problem(world, state, data, free={"d0.v": dr.real()}).dt == 0.02
+
+
 def test_spheres_keep_momentum_and_lose_energy(many):
     """27 spheres that fly into each other, of unequal principal inertias, with friction."""
     rng = np.random.default_rng(5)

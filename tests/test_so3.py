@@ -1,6 +1,7 @@
 """Rotations of space: two forms of each verb, for one world and for a batch."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -55,3 +56,10 @@ def test_rotations_agree_with_their_matrix():
     p = some("quaternion")
     assert_allclose(so3.rotate(so3.compose(q, p), r), R @ so3.rotate(p, r), rtol=1e-12, atol=1e-14)
     assert_allclose(so3.compose(p, so3.difference(p, q)), q, rtol=1e-12, atol=1e-14)
+
+
+def test_logarithm_of_small_turns_is_exact():
+    """On both sides of where it becomes a series."""
+    angle = np.geomspace(1e-7, 1e-2, 41)
+    r = angle * np.array([0.6, -0.48, 0.64])[:, None]
+    assert_allclose(so3.log(so3.exp(jnp.asarray(r))), r, rtol=1e-14)

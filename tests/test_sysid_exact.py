@@ -132,7 +132,7 @@ def test_an_angle_in_degrees_is_one_in_radians():
 
 
 def test_what_is_seen_only_together_has_no_interval():
-    """Of a ball on a floor only the sum of its radius and the height of the floor; of each record start and clock."""
+    """Of a ball on a floor only the sum of its radius and the height of the floor."""
 
     def scene(height):
         ball = dr.Body(dr.Disc(radius=0.05), mass=1.0, inertia=1.0, x=(0.0, 0.55))
@@ -148,11 +148,20 @@ def test_what_is_seen_only_together_has_no_interval():
     assert any("floor.shape.offset" in note and "ball.shape.radius" in note for note in found.notes)
 
 
-def test_a_fit_that_is_none_says_so(records):
-    """In millimetres, with the noise estimated; and a start that a joint does not allow."""
+def test_what_each_record_shows_only_together_has_no_interval_in_any(records):
+    """Where it begins, and by how much its column is off."""
+    free = FREE | {"p.x.bias": dr.each(dr.real())}
+    found = dr.fit(*point(), records[:2], free=free, noise={"p.x": NOISE}, progress=False)
+    assert np.isinf(found["p.x"].high).all() and np.isinf(found["p.x.bias"].low).all()
+    assert np.isfinite(found["p.v"].high).all() and np.isfinite(found["gravity"].high).all()
+
+
+@pytest.mark.parametrize("column", ["p.x", "p.x[1]"])
+def test_a_fit_that_is_none_says_so(records, column):
+    """In millimetres, with the noise estimated; also where only the height is seen."""
     r = records[0].observations
-    data = {"t": r["t"], "p.x": 1e3 * r["p.x"]}
-    found = dr.fit(*point(), data, free={"gravity": dr.interval(-20, 20)}, progress=False)
+    data = {"t": r["t"], column: 1e3 * (r["p.x"] if column == "p.x" else r["p.x"][:, 1])}
+    found = dr.fit(*point(), data, free={"gravity[1]": dr.interval(-20, 20)}, progress=False)
     assert found.notes[0].startswith("this is no fit: residuals of p.x are as large")
     again = found.with_intervals(sysid.from_jacobian)
     assert again.notes == found.notes

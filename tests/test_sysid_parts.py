@@ -20,6 +20,7 @@ from diffrigid.step import steps_in
 from diffrigid.sysid.diagnosis import doubts, normality, whiteness
 from diffrigid.sysid.orders import in_words
 from diffrigid.sysid.records import columns, read_csv
+from diffrigid.sysid.sampling import Posterior
 from diffrigid.sysid.sensors import channel_of, difference, predict
 from diffrigid.sysid.summary import Parameter, Summary
 
@@ -82,6 +83,21 @@ def test_what_is_not_finite_is_kept_in_a_file(tmp_path):
         assert_array_equal(getattr(again["a"], field), getattr(parameter, field))
     assert_array_equal(again.costs, kept.costs)
     assert np.isnan(again.noise["ball.x"])
+
+
+def test_numbers_that_were_fitted_together_have_their_own_names():
+    ends = [np.array(pair) for pair in ([1.0, 3.0], [0.9, 2.9], [1.1, 3.1])]
+    shares, tied = Parameter("a.mass : b.mass", *ends, "kg", ""), Parameter("a.x = b.x", *ends, "m", "")
+    fit = Summary((shares, tied), {}, np.zeros(1), 1, (), (), 0, 1.0, {})
+    assert (fit["b.mass"].value, fit["b.mass"].low, fit["a.mass"].high) == (3.0, 2.9, 1.1)
+    assert_array_equal(fit["b.x"].value, [1.0, 3.0])
+
+
+def test_a_posterior_of_a_component_prints_its_table():
+    parameter = Parameter("a.v[1]", *(np.asarray(end) for end in (1.0, 0.9, 1.1)), "m/s", "")
+    fit = Summary((parameter,), {}, np.zeros(1), 1, (), (), 0, 1.0, {})
+    lines = repr(Posterior({}, (parameter,), {"a.v[1]": 1.002}, {"a.v[1]": 345.0}, fit, ())).splitlines()
+    assert lines[2].startswith("a.v[1]") and "1.002" in lines[2] and "345" in lines[2]
 
 
 def test_a_clock_that_jitters_takes_one_step_for_each_frame():
@@ -328,6 +344,7 @@ def test_residuals_of_noise_are_believed_and_others_are_not():
     drift = noise[0] + np.sin(np.arange(300) / 20)
     assert "follow each other" in doubts([drift], None)[0]
     assert any("not normal" in text for text in doubts([noise[0] ** 3], None))
+    assert not any("not normal" in text for text in doubts([noise[0] ** 3], None, robust=True))
     assert any("times the noise" in text for text in doubts([3 * noise[1]], 1.0))
 
 
