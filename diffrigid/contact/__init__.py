@@ -3,7 +3,8 @@
 To read it, in the order of a step; `model.py` first, which runs the passes:
 
     where paths begin     anchors.py
-    when shapes meet      impact.py; a search (search.py, approach.py, gaps.py) where there is no closed form
+    when shapes meet      impact.py; a search (search.py, approach.py, nearing.py, gaps.py) where there is
+                          no closed form
     all of them           strikes.py lists the contacts, with coefficients, stops.py the rows of joints, rolling.py
                           those against turning; sides.py sums over the pairs of each body
     whose turn it is      order.py

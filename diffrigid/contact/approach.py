@@ -6,16 +6,15 @@ Source: Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems (1996), 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.branches import any_world
 from diffrigid.collide.heights import height_over, unseen_for
-from diffrigid.contact.gaps import NEAR, Gaps, gaps_at
+from diffrigid.contact.gaps import NEAR, Gaps
 from diffrigid.contact.sides import Side, centre, earliest, reach_of
 from diffrigid.gathers import MANY, fold
-from diffrigid.numerics import norm, safe_divide, safe_sqrt, softplus
+from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.shapes import HeightField
 from diffrigid.state import rotations
 
@@ -136,37 +135,6 @@ def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Poli
     return Polish(jnp.where(jnp.isfinite(dt) & within, dt, 0.0), at_level.any(0), inside.any(0))
 
 
-class Closest(NamedTuple):
-    """The contact with the least gap near the closest approach of two paths."""
-
-    gap: Array  # (*batch) [m]
-    rate: Array  # (*batch) [m/s]
-    curvature: Array  # (*batch) [m/s^2]: a difference of its rates, which holds what corners and turning faces add
-
-    def step(self) -> Array:
-        """(*batch) [s] towards the closest approach."""
-        return -jnp.where(self.curvature > 0, safe_divide(self.rate, self.curvature), 0.0)
-
-    def level(self, width: Array) -> Array:
-        """Level of a smooth impact, (*batch) [m], for a width (*batch) [m]."""
-        turns_back = self.curvature > 0
-        square = safe_divide(self.rate * self.rate, jnp.where(turns_back, self.curvature, 0.0))
-        return jnp.where(turns_back, softplus(self.gap - 0.5 * square, width), 0.0)
-
-
-def closest(a: Side, b: Side, t: Array, eta: Array, live: Array) -> Closest:
-    """At t (*batch) [s], with the rates at t - eta and t + eta."""
-    gaps = jax.vmap(lambda t: gaps_at(a, b, t, live)[:2])(jnp.stack([t - eta, t, t + eta]))
-    chosen = deepest(gaps[0][1])
-    before, rate, after = (chosen[None] * gaps[1]).sum(1)
-    return Closest((chosen * gaps[0][1]).sum(0), rate, safe_divide(after - before, 2.0 * eta))
-
-
-def deepest(gap: Array) -> Array:
-    """1 for the least of the gaps (K, *batch), else 0."""
-    return jax.nn.one_hot(jnp.argmin(gap, 0), len(gap), axis=0, dtype=gap.dtype)
-
-
 def _time_to(height: Array, v: Array, acc: Array) -> Array:
     """Time until height + v t + acc t^2 / 2 next falls through zero; negative if inside and closing; inf: never."""
     D = v * v - 2.0 * acc * height
@@ -182,6 +150,14 @@ def _least(times: Array) -> Array:
     return fold(jnp.minimum, times, 0) if len(times) <= MANY else times.min(0)
 
 
+def turn_rate(side: Side) -> Array:
+    """Angular speed where its path begins, (*batch) [rad/s]."""
+    f = side.flight
+    if f is None:
+        return jnp.zeros_like(side.x[0])
+    return norm(rotations(f.dim).unspin(f.inverse_inertia, f.q, f.L))
+
+
 def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
     """Bounds within the step on what spin and acceleration add to the speed of a point, and on its third derivative.
 
@@ -192,7 +168,7 @@ def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
     if f is None:
         return jnp.zeros_like(span), jnp.zeros_like(span)
     so, reach = rotations(f.dim), reach_of(side)
-    w, a = norm(so.unspin(f.inverse_inertia, f.q, f.L)), norm(f.a)
+    w, a = turn_rate(side), norm(f.a)
     jerk = 8.0 * w * w * w * reach
     if f.jerk is not None:
         a, jerk = a + span * norm(f.jerk), jerk + norm(f.jerk)

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.collide import Contacts
@@ -53,6 +54,11 @@ def _gaps_of_corners(a: Side, at: Placed, b: Side) -> Gaps:
         h[None] + jax.vmap(dot, (None, 0))(so.unrotate(at.q, n), r) for h, n in zip(heights, axes, strict=True)
     )
     return Gaps(height, rate, acceleration, None)
+
+
+def deepest(gap: Array) -> Array:
+    """1 for the least of the gaps (K, *batch), else 0."""
+    return jax.nn.one_hot(jnp.argmin(gap, 0), len(gap), axis=0, dtype=gap.dtype)
 
 
 def at_corners(a: Side, at: Placed, contacts: Contacts, of_corners: Array) -> Array:

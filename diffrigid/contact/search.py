@@ -21,29 +21,16 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import any_world, choose, opaque_true
-from diffrigid.contact.approach import (
-    Closest,
-    Polish,
-    Task,
-    clearance,
-    closest,
-    deepest,
-    if_smooth,
-    polish,
-    resting,
-    task_of,
-)
+from diffrigid.contact.approach import Polish, Task, clearance, if_smooth, polish, resting, task_of
 from diffrigid.contact.gaps import Gaps, gaps_at
+from diffrigid.contact.nearing import Closest, Nearing, from_time, level_at, look_at, nearer
 from diffrigid.contact.sides import Side, earliest
-from diffrigid.numerics import FOUND, safe_divide
+from diffrigid.numerics import FOUND
 from diffrigid.shapes import HalfSpace, HeightField
 
 CROSSED = 3  # advances for each node along a side of a grid: the length of its diagonal in half cells
 ADVANCES = 48  # conservative advances at most, each at least the gap over a bound on the closing speed
 POLISH = 12  # steps along the local parabola of the gap at most; near the impact the error is squared by each
-TURN = 3  # looks for one step towards the closest approach
-TURNS = 6  # of these steps at most
-ETA = 0.25  # [-] of the step: how far before and after it the rates are taken
 ADVANCING, NEARING, POLISHING, DONE = range(4)
 
 
@@ -58,12 +45,14 @@ def approach_search(
     search = _stage_by_stage if isinstance(b.shape, HalfSpace) else _in_one_loop
     end = search(task, jnp.where(at_end, task.t1, task.start), at_end, live)
     level = jnp.zeros_like(end.s)
-    if end.closest is not None:
+    if width is not None and end.closest is not None:
 
-        def smooth(t: Array) -> Array:
-            return closest(a, b, t, ETA * task.span, live).level(width)  # type: ignore[arg-type]
+        def smooth(nearest: Closest) -> Array:
+            closing, opening = (look_at(t, gaps_at(a, b, t, live)) for t in (nearest.before, nearest.after))
+            return jnp.where(nearest.exists, level_at(closing, opening, width), 0.0)
 
-        level = if_smooth(width, smooth, jnp.zeros_like, checkpoint_name(end.closest, FOUND))
+        nearest = checkpoint_name(end.closest, FOUND)
+        level = if_smooth(width, smooth, lambda nearest: jnp.zeros_like(nearest.before), nearest)
     s, (_, bound) = jnp.where(end.found, end.s, end.near), earliest(task.a, task.b)
     rests = checkpoint_name(end.rests, FOUND)
     return jnp.where(s < bound, task.start, s), level, end.found | end.inside, rests
@@ -73,11 +62,11 @@ class Found(NamedTuple):
     """What a search ends with."""
 
     s: Array  # (*batch) [s] where they meet, if `found`
-    near: Array  # (*batch) [s] where the advances ended
+    near: Array  # (*batch) [s] where the polishing began
     found: Array  # (*batch) bool: some contact is at its level
-    inside: Array  # (*batch) bool: some contact was within its level and closing when the advances ended
+    inside: Array  # (*batch) bool: some contact was within its level and closing there
     rests: Array  # (K, *batch) bool: contacts that rest, which are left out
-    closest: Array | None  # (*batch) [s] of the closest approach; None: exact
+    closest: Closest | None  # None: exact
 
 
 def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Found:
@@ -98,14 +87,16 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
     _, near, _, rests = lax.while_loop(flying, advance, first)
 
     def approach(near):
-        def nearer(_, t):
-            step = closest(task.a, task.b, t, ETA * task.span, live).step()
-            return jnp.clip(t + step, near - task.span, near + task.span)
+        def look(now):
+            return nearer(task, now, gaps_at(task.a, task.b, now.t, live))
 
-        t = lax.fori_loop(0, TURNS, nearer, near)
-        return t, closest(task.a, task.b, t, ETA * task.span, live).level(task.width)  # type: ignore[arg-type]
+        seen = lax.while_loop(lambda now: ~at_end & any_world(~now.done), look, from_time(near))
+        return _polished_from(task, near, seen), seen.level(task.width), seen.closest()
 
-    nearest, level = if_smooth(task.width, approach, lambda near: (near, jnp.zeros_like(near)), near)
+    def exact(near):
+        return near, jnp.zeros_like(near), from_time(near).closest()
+
+    near, level, nearest = if_smooth(task.width, approach, exact, near)
 
     def polishing(carry):
         count, _, look = carry
@@ -125,16 +116,6 @@ def _count(task: Task, start: Array, live: Array) -> int:
     return len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start, live).gap))
 
 
-class Turn(NamedTuple):
-    """One step towards the closest approach, of which looks at three times are part."""
-
-    t: Array  # (*batch) [s]
-    chosen: Array  # (K, *batch) 1 for the contact with the least gap, else 0
-    gap: Array  # (*batch) [m] at t
-    rate: Array  # (*batch) [m/s] at t
-    before: Array  # (*batch) [m/s] a quarter of the step before
-
-
 class Search(NamedTuple):
     """How far it has come."""
 
@@ -147,7 +128,7 @@ class Search(NamedTuple):
     found: Array
     inside: Array
     level: Array  # (*batch) [m]
-    turn: Turn | None
+    nearing: Nearing | None  # None: exact
 
 
 def _in_one_loop(task: Task, start: Array, at_end: Array, live: Array) -> Found:
@@ -157,15 +138,16 @@ def _in_one_loop(task: Task, start: Array, at_end: Array, live: Array) -> Found:
         start < start,
     )
     stage = jnp.full(start.shape, ADVANCING, np.int32)
-    turn = None if task.width is None else Turn(start, none, zero, zero, zero)
-    first = Search(0, stage, jnp.zeros_like(stage), start, none > 0, start, no, no, zero, turn)
+    nearing = None if task.width is None else from_time(start)
+    first = Search(0, stage, jnp.zeros_like(stage), start, none > 0, start, no, no, zero, nearing)
     follow = _follower(task)
 
     def busy(now: Search) -> Array:
         return ~at_end & any_world(now.stage < DONE)
 
     end = lax.while_loop(busy, lambda now: follow(now, gaps_at(task.a, task.b, now.s, live)), first)
-    return Found(end.s, end.near, end.found, end.inside, end.rests, None if end.turn is None else end.turn.t)
+    nearest = None if end.nearing is None else end.nearing.closest()
+    return Found(end.s, end.near, end.found, end.inside, end.rests, nearest)
 
 
 def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
@@ -181,10 +163,10 @@ def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
             return following
         nears = now.stage == NEARING
 
-        def nearer(following: Search) -> Search:
+        def look(following: Search) -> Search:
             return choose(nears, _nearer(task, following, gaps), following)
 
-        return lax.cond(any_world(nears), nearer, lambda following: following, following)
+        return lax.cond(any_world(nears), look, lambda following: following, following)
 
     return follow
 
@@ -210,21 +192,17 @@ def _polished(task: Task, now: Search, gaps: Gaps) -> Search:
 
 
 def _nearer(task: Task, now: Search, gaps: Gaps) -> Search:
-    """After one of three looks of a step towards the closest approach: at its time, before, and after it."""
-    eta, look, c = ETA * task.span, now.tries % TURN, now.turn
-    assert c is not None
-    first, last = look == 0, look == TURN - 1
-    chosen = jnp.where(first[None], deepest(gaps.gap), c.chosen)
-    t, rate = jnp.where(now.tries == 0, now.near, c.t), (chosen * gaps.rate).sum(0)
-    gap, before = jnp.where(first, (chosen * gaps.gap).sum(0), c.gap), jnp.where(last, c.before, rate)
-    c = Turn(t=t, chosen=chosen, gap=gap, rate=jnp.where(first, rate, c.rate), before=before)
-    seen = Closest(c.gap, c.rate, safe_divide(rate - c.before, 2.0 * eta))
-    onward = jnp.clip(t + seen.step(), now.near - task.span, now.near + task.span)
-    ends = last & ((jnp.abs(onward - t) <= task.slack * task.span) | (now.tries >= TURN * TURNS))
-    c = c._replace(t=jnp.where(last & ~ends, onward, t))
-    s = jnp.where(ends, now.near, jnp.where(last, c.t, jnp.where(first, t - eta, t + eta)))
-    level = jnp.where(ends, seen.level(task.width), now.level)  # type: ignore[arg-type]
+    """After a look for the closest approach; where it is found the next stage begins."""
+    assert now.nearing is not None
+    seen = choose(now.tries == 0, from_time(now.near), now.nearing)
+    seen = nearer(task, seen, gaps)
+    near = jnp.where(seen.done, _polished_from(task, now.near, seen), now.near)
     return now._replace(
-        s=s, turn=c, level=level, tries=jnp.where(ends, 0, now.tries + 1),
-        stage=jnp.where(ends, POLISHING, NEARING).astype(np.int32),
+        s=jnp.where(seen.done, near, seen.t), near=near, level=seen.level(task.width), nearing=seen,
+        tries=jnp.where(seen.done, 0, now.tries + 1), stage=jnp.where(seen.done, POLISHING, NEARING).astype(np.int32),
     )  # fmt: skip
+
+
+def _polished_from(task: Task, near: Array, seen: Nearing) -> Array:
+    """(*batch) [s] the end of the advances, which may lie behind the closest approach, or before it."""
+    return jnp.maximum(jnp.minimum(near, seen.comes_to(seen.level(task.width))), task.start)

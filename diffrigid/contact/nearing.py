@@ -1,0 +1,134 @@
+"""The closest approach of two paths, from a time on: it sets the level of a smooth impact.
+
+Forward by steps that grow until the least gap opens, or back over the step if it opens already; then false position for
+the root of its rate, in the form that halves the rate it keeps (Dowell and Jarratt 1971). Two convex bodies that do not
+turn have one closest approach, however far ahead; of those that turn it is the next one.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from diffrigid.branches import choose
+from diffrigid.contact.approach import Task, turn_rate
+from diffrigid.contact.gaps import Gaps, deepest
+from diffrigid.numerics import safe_divide, safe_sqrt, softplus
+
+LOOKS = 48  # at most
+FIRST = 0.25  # [-] of the step: the first step forward
+TURN = 0.5  # [rad] of the two against each other, in one step forward at most
+DEEP = 40.0  # [-] of the width: a hit so deep is exact to rounding
+
+
+class Look(NamedTuple):
+    """At the least gap of a pair."""
+
+    t: Array  # (*batch) [s]
+    gap: Array  # (*batch) [m]
+    rate: Array  # (*batch) [m/s]
+
+
+class Closest(NamedTuple):
+    """Between which times two paths come closest."""
+
+    before: Array  # (*batch) [s]
+    after: Array  # (*batch) [s]
+    exists: Array  # (*batch) bool
+
+
+class Nearing(NamedTuple):
+    """How far the search has come."""
+
+    t: Array  # (*batch) [s] of the next look
+    looks: Array  # (*batch) int
+    step: Array  # (*batch) [s] the last one forward
+    closing: Look  # the latest at which it closes; time -inf: none yet
+    opening: Look  # the earliest at which it opens; time inf: none yet
+    closed: Array  # (*batch) bool: it closed at the last look
+    kept: Array  # (*batch) what false position makes of the rate that it keeps
+    later: Array  # (*batch) [m] below this gap it comes to its level after the end of the step
+    done: Array  # (*batch) bool
+    turns_back: Array  # (*batch) bool: there is a closest approach, between the two
+
+    def closest(self) -> Closest:
+        """Without what only the search needs; its times are finite in any case."""
+        before, after = (jnp.where(self.turns_back, look.t, self.t) for look in (self.closing, self.opening))
+        return Closest(before, after, self.turns_back)
+
+    def level(self, width: Array | None) -> Array:
+        """Level of a smooth impact, (*batch) [m], for a width (*batch) [m]."""
+        assert width is not None
+        return jnp.where(self.turns_back, level_at(self.closing, self.opening, width), 0.0)
+
+    def comes_to(self, level: Array) -> Array:
+        """About when the gap comes to its level [m], on the way in, (*batch) [s]; inf: there is no closest approach."""
+        low, high = self.closing, self.opening
+        above = safe_divide(2.0 * jnp.maximum(level - low.gap, 0.0) * (high.t - low.t), high.rate - low.rate)
+        return jnp.where(self.turns_back, low.t - safe_sqrt(above), jnp.inf)
+
+
+def level_at(closing: Look, opening: Look, width: Array) -> Array:
+    """Level of a smooth impact, (*batch) [m]: at the closest approach, just before and after, for a width (*batch) [m].
+
+    There the two tangents of the gap meet, which it may do in a kink, where another face becomes the nearest.
+    """
+    low, high, span = lax.stop_gradient((closing.rate, opening.rate, opening.t - closing.t))
+    share = safe_divide(high, high - low)  # so weighted, it does not depend on the time
+    return softplus(share * closing.gap + (1.0 - share) * opening.gap + share * low * span, width)
+
+
+def look_at(t: Array, gaps: Gaps) -> Look:
+    """The least of the gaps at t (*batch) [s]."""
+    chosen = lax.stop_gradient(deepest(gaps.gap))
+    return Look(t, (chosen * gaps.gap).sum(0), (chosen * gaps.rate).sum(0))
+
+
+def from_time(t: Array) -> Nearing:
+    """Before the first look, which is at t (*batch) [s]."""
+    zero, no = jnp.zeros_like(t), t < t
+    never, looks = zero + jnp.inf, jnp.zeros(t.shape, np.int32)
+    return Nearing(t, looks, zero, Look(-never, zero, zero), Look(never, zero, zero), no, zero + 1.0, -never, no, no)
+
+
+def nearer(task: Task, now: Nearing, gaps: Gaps) -> Nearing:
+    """After the look at `now.t`."""
+    assert task.width is not None
+    here, first = look_at(now.t, gaps), now.looks == 0
+    closes, within = here.rate < 0, task.slack * task.span
+    closing, opening = choose(closes, here, now.closing), choose(closes, now.opening, here)
+    between = (closing.t > -jnp.inf) & (opening.t < jnp.inf)
+    again = ~first & (closes == now.closed)  # a second time: else false position would come near from one side only
+    kept = jnp.where(again, 0.5 * now.kept, 1.0)
+    step = jnp.where(first, FIRST * task.span, 2.0 * now.step)
+    for rate, most in ((turn_rate(task.a) + turn_rate(task.b), TURN), (-here.rate, _ahead(here.gap, task.width))):
+        step = jnp.where(rate > 0, jnp.minimum(step, most / jnp.maximum(rate, task.slack)), step)
+    root = jnp.clip(_root(closing, opening, closes, kept), closing.t + within, opening.t - within)
+    following = jnp.where(between, root, jnp.where(closes, now.t + step, task.start))
+    # What was not met by the end of the step, and comes nearer by more than a width, comes to its level later.
+    later = jnp.where(first, jnp.where(now.t < task.t1, -jnp.inf, here.gap - task.width), now.later)
+    deep = (jnp.maximum(here.gap, 0.0) < later) | (here.gap < -DEEP * task.width)
+    opens = ~between & ~closes & (now.t <= task.start)
+    ends = deep | opens | (between & (opening.t - closing.t <= 2.0 * within)) | (now.looks >= LOOKS)
+    after = Nearing(
+        t=following, looks=now.looks + 1, step=step, closing=closing, opening=opening, closed=closes, kept=kept,
+        later=later, done=ends, turns_back=between & ~deep,
+    )  # fmt: skip
+    return choose(now.done, now, after)
+
+
+def _ahead(gap: Array, width: Array) -> Array:
+    """How much the gap may fall until the next look, (*batch) [m]: to zero, and from there on little by little.
+
+    Inside the nearest corners and faces change, and the first of several least gaps is to be found.
+    """
+    return jnp.maximum(gap, 0.0) + jnp.maximum(0.5 * width, 0.25 * jnp.abs(gap))
+
+
+def _root(closing: Look, opening: Look, closes: Array, kept: Array) -> Array:
+    """Where the rate is zero on a line between the two, (*batch) [s]; that of the end not looked at now counts less."""
+    low = closing.rate * jnp.where(closes, 1.0, kept)
+    high = opening.rate * jnp.where(closes, kept, 1.0)
+    share = safe_divide(low, low - high)
+    return closing.t + share * jnp.where(share > 0, opening.t - closing.t, 0.0)
