@@ -59,7 +59,7 @@ def of_each(row: Callable, groups: tuple[Placed, ...], *args: Array) -> Array:
     return jnp.concatenate([part if part.shape[1] == most else filled(part) for part in parts])
 
 
-def _change(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array) -> Array:
+def change(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array) -> Array:
     """Rate of a function of(a, b) of the poses of two bodies, for their twists u (2, D + A, *batch)."""
     return jax.jvp(of, (a, b), _tangents(so, a, b, u))[1]
 
@@ -71,7 +71,7 @@ def _tangents(so: ModuleType, a: Pose, b: Pose, u: Array) -> tuple[Pose, Pose]:
 
 def _acceleration(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array, du: Array) -> Array:
     """Second derivative by time of a function of(a, b), for twists u and their rates du (2, D + A, *batch)."""
-    rate = functools.partial(_change, so, of)
+    rate = functools.partial(change, so, of)
     return jax.jvp(rate, (a, b, u), (*_tangents(so, a, b, u), du))[1]
 
 
@@ -80,7 +80,7 @@ def by_twists(so: ModuleType, of: Callable, a: Pose, b: Pose) -> Array:
     n, batch = so.D + so.A, a.x.shape[1:]
     units = jnp.eye(2 * n, dtype=a.x.dtype).reshape(2 * n, 2, n, *[1] * len(batch))
     units = units + jnp.zeros_like(a.x[:1])[None, None]
-    return jax.vmap(lambda unit: _change(so, of, a, b, unit), out_axes=1)(units)
+    return jax.vmap(lambda unit: change(so, of, a, b, unit), out_axes=1)(units)
 
 
 def _held(so: ModuleType, joint: Any) -> Callable:
@@ -95,7 +95,7 @@ def joint_errors(so: ModuleType, groups: tuple[Placed, ...]) -> Array:
 
 def joint_rates(so: ModuleType, groups: tuple[Placed, ...], twists: Array) -> Array:
     """J u for the twists u of the bodies of all joints, (n, 2, D + A, *batch) -> (n, E, *batch) [m/s or rad/s]."""
-    return of_each(lambda joint, a, b, u: _change(so, _held(so, joint), a, b, u), groups, twists)
+    return of_each(lambda joint, a, b, u: change(so, _held(so, joint), a, b, u), groups, twists)
 
 
 def joint_accelerations(so: ModuleType, groups: tuple[Placed, ...], twists: Array, rates: Array) -> Array:

@@ -36,7 +36,8 @@ class Revolute:
     """A hinge: two points stay together and, in 3D, two axes stay parallel.
 
     Anchors and axes are in body axes, from the centre of mass; for `b=None`, the world, anchor_b is a world
-    point. What is not given of b is taken from where the bodies are at the start.
+    point. What is not given of b is taken from where the bodies are at the start, and there, in 3D or with limits,
+    the angle is 0; else it is the difference of the angles of both.
 
     Example:
         >>> door = dr.Body(None, mass=9.0, inertia=0.6, x=(0.4, 0.0))
@@ -52,7 +53,7 @@ class Revolute:
     anchor_b: Leaf = array("D", default=None)  # (D, *batch) [m]
     axis_a: Leaf = array("D", default=None)  # (3, *batch) [-] 3D
     axis_b: Leaf = array("D", default=None)  # (3, *batch) [-] 3D
-    zero: Leaf = array("Q", default=None)  # (Q, *batch) orientation of a in the axes of b at angle 0; for limits
+    zero: Leaf = array("Q", default=None)  # (Q, *batch) orientation of a in the axes of b at angle 0
     lower: Leaf = array(default=None)  # (*batch) [rad]
     upper: Leaf = array(default=None)  # (*batch) [rad]
     restitution: Leaf = array(default=None)  # (*batch) [-] at the limits; None: 0

@@ -4,6 +4,7 @@ restitution, friction, ..., gravity      a coefficient of all bodies and statics
 contact.width, contact.rest_speed        numbers of the contact model
 FORCE.field                              a force of the scene, by its name: "drag.linear"
 JOINT.field                              a joint of the scene, by its name: "revolute.anchor_a"
+JOINT.angle | rate, JOINT.translation | rate    initial state of a hinge, of a slider, with all that hangs on it
 BODY.mass | inertia | restitution | friction | ... | shape.FIELD
 BODY.x | v | q | w | angle               initial state (angle: 2D)
 STATIC.x | q | angle | restitution | friction | ... | shape.FIELD
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from diffrigid import so2
+from diffrigid import joint_motion, so2
 from diffrigid.convert import Numbers, known, nearest, numbers
 from diffrigid.forces import Gravity
 from diffrigid.joints import Revolute
@@ -37,11 +38,13 @@ UNITS = {
     "radius": "m", "half": "m", "half_length": "m", "vertices": "m", "points": "m", "offset": "m", "width": "m",
     "heights": "m", "spacing": "m",
     "linear": "N s/m", "angular": "N m s/rad", "stiffness": "N/m", "damping": "N s/m", "length": "m",
-    "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
+    "translation": "m", "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
     "restitution_falloff": "s/m", "rolling_friction": "m", "spinning_friction": "m",
 }  # fmt: skip
-ABOUT = {"lower": "rad", "upper": "rad", "speed": "rad/s", "friction": "N m", "damping": "N m s/rad"}  # an axis
-ALONG = {"lower": "m", "upper": "m", "speed": "m/s", "friction": "N", "damping": "N s/m"}
+ABOUT_AXIS = {
+    "lower": "rad", "upper": "rad", "rate": "rad/s", "speed": "rad/s", "friction": "N m", "damping": "N m s/rad",
+}  # fmt: skip
+ALONG_AXIS = {"lower": "m", "upper": "m", "rate": "m/s", "speed": "m/s", "friction": "N", "damping": "N s/m"}
 
 
 class Place(NamedTuple):
@@ -50,6 +53,9 @@ class Place(NamedTuple):
     chain: tuple[str | int, ...]
     row: int | None  # None: all of it
     angle: bool = False  # the leaf is q, the value an angle
+    joint: tuple[str, str] | None = (
+        None  # its name and "angle", "translation" or "rate", of which leaf and row are part
+    )
 
 
 def read(world: World, state: State, path: str) -> Array:
@@ -65,6 +71,8 @@ def read(world: World, state: State, path: str) -> Array:
     if index is not None:
         return _item(read(world, state, whole), whole, index)
     place = places(world, path)[0]
+    if place.joint:
+        return joint_motion.read(world, state, *place.joint)
     leaf: Any = (world, state)
     for key in place.chain:
         leaf = leaf[key] if isinstance(key, int) else getattr(leaf, key)
@@ -93,6 +101,9 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
         vector = read(world, state, whole)
         part = numbers(path, value, _item(vector, whole, index).shape, finite=False)
         return write(world, state, whole, _with_rows(vector, index, part.astype(vector.dtype)))
+    if joint := places(world, path)[0].joint:
+        number = jnp.asarray(numbers(path, value, (), finite=False), state.x.dtype)
+        return world, joint_motion.write(world, state, *joint, number)
     pair: Any = (world, state)
     for place in places(world, path):
         pair = _update(pair, place.chain, lambda record, field, place=place: _set(record, field, place, path, value))
@@ -103,7 +114,7 @@ def unit(world: World, path: str) -> str:
     """SI unit of a parameter; "" where it has none or is unknown."""
     owner, _, field = component(path)[0].rpartition(".")
     kinds = [joint for names, joint in zip(world.joint_names, world.joints, strict=True) if owner in names]
-    along = {} if not kinds else ABOUT if isinstance(kinds[0], Revolute) else ALONG
+    along = {} if not kinds else ABOUT_AXIS if isinstance(kinds[0], Revolute) else ALONG_AXIS
     return along.get(field, UNITS.get(field, ""))
 
 
@@ -119,6 +130,13 @@ def places(world: World, path: str) -> list[Place]:
     return known[whole]
 
 
+def order_of(world: World, path: str) -> int:
+    """1 for the angle or translation of a joint, 2 for its rate, 0 for anything else; they are set in this order."""
+    known = catalogue(world).get(component(path)[0], [])
+    joint = known[0].joint if known else None
+    return 0 if joint is None else 1 + (joint[1] == joint_motion.RATE)
+
+
 def hint(world: World, path: str, known: Iterable[str]) -> str:
     """What was meant by a path that is none of those known."""
     owner, _, field = path.rpartition(".")
@@ -127,6 +145,8 @@ def hint(world: World, path: str, known: Iterable[str]) -> str:
     of_body = owner in world.names and field in COEFFICIENTS
     if of_body or (owner in owners and field in array_fields(owners[owner])):
         return f"it was left out when the scene was made: give {owner} a {field} to begin with."
+    if owner in dict(joints) and field in joint_motion.fields_of(owners[owner]):
+        return f"{owner} is part of a closed loop, so that what hangs on it cannot be moved alone: set bodies instead."
     return nearest(path, known)
 
 
@@ -167,6 +187,10 @@ def catalogue(world: World) -> dict[str, list[Place]]:
             for field in array_fields(joint):
                 if getattr(joint, field) is not None:
                     out[f"{name}.{field}"] = [Place((0, "joints", group, field), row)]
+            _, moved = joint_motion.moving_side(world, name)
+            for field in joint_motion.fields_of(joint) if moved else ():
+                leaves = ("v", "w") if field == joint_motion.RATE else ("x", "q")
+                out[f"{name}.{field}"] = [Place((1, leaf), moved[0], joint=(name, field)) for leaf in leaves]
     out |= {f"contact.{field}": [Place((0, "contact", field), None)] for field in array_fields(world.contact)}
     for row, name in enumerate(world.names):
         out |= {f"{name}.{f}": [Place((0, "bodies", f), row)] for f in ("mass", "inertia", *coefficients)}

@@ -119,7 +119,7 @@ def test_a_start_at_zero_of_a_positive_parameter_is_moved_off():
 
 def reading(what, world=WORLD, state=STATE):
     channel = jax.tree.map(jnp.asarray, channel_of("c", what, world))
-    return np.asarray(predict(channel, jax.tree.map(lambda leaf: leaf[None], state)))[0]
+    return np.asarray(predict(channel, world, jax.tree.map(lambda leaf: leaf[None], state)))[0]
 
 
 def test_observers_read_what_geometry_says():
@@ -145,10 +145,10 @@ def test_cameras():
 def test_angles_are_compared_up_to_full_turns():
     states = jax.tree.map(lambda leaf: leaf[None], STATE)
     channel = jax.tree.map(jnp.asarray, channel_of("cue.angle", "cue.angle", WORLD))
-    assert_allclose(difference(channel, states, jnp.array([[0.4 + 6 * np.pi]])), [[0.1]], atol=1e-12)
+    assert_allclose(difference(channel, WORLD, states, jnp.array([[0.4 + 6 * np.pi]])), [[0.1]], atol=1e-12)
     channel = jax.tree.map(jnp.asarray, channel_of("cue.q", "cue.q", WORLD))
     measured = jnp.array([[np.cos(0.4), np.sin(0.4)]])
-    assert_allclose(difference(channel, states, measured), [[0.1]], atol=1e-12)
+    assert_allclose(difference(channel, WORLD, states, measured), [[0.1]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

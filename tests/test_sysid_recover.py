@@ -232,6 +232,7 @@ def test_where_the_hinge_of_a_pendulum_is_on_the_rod():
     fit = dr.fit(*pendulum(0.5), data, free={"hinge.anchor_a": dr.real()}, dt=1 / 40, progress=False)
     half = 0.5 * (fit["hinge.anchor_a"].high - fit["hinge.anchor_a"].low)
     assert "the fitted start is 0.1 m (or rad) off the joint hinge" in fit.notes[0]  # its anchor_b stays where it was
+    assert fit.notes[0].endswith("or hinge.angle")
     assert np.all(np.abs(fit["hinge.anchor_a"].value - (-0.4, 0.0)) < WIDE * half) and half[0] < 0.02
 
 

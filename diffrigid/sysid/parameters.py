@@ -80,9 +80,14 @@ def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
     """The scene with the parameters for z (n,)."""
     used = [(slot, piece) for slot, piece in zip(slots, split(slots, z), strict=True) if slot.paths]
     values = [slot.kind.value(piece, reference(slot, scene)) for slot, piece in used]
-    for (slot, _), value in zip(used, values, strict=True):
-        for k, path in enumerate(slot.paths):
-            scene = write(scene, path, value[k] if slot.joint else value)
+    numbers = [
+        (path, value[k] if slot.joint else value)
+        for (slot, _), value in zip(used, values, strict=True)
+        for k, path in enumerate(slot.paths)
+    ]
+    # Bodies are moved along joints when anchors and velocities are as they will be.
+    for path, value in sorted(numbers, key=lambda number: paths.order_of(scene.world, number[0])):
+        scene = write(scene, path, value)
     return scene
 
 

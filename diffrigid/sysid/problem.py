@@ -25,7 +25,7 @@ from diffrigid.step import aligned, scan_steps
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
 from diffrigid.sysid.records import Run, Series
-from diffrigid.sysid.sensors import Part, difference
+from diffrigid.sysid.sensors import Part, difference, is_angle
 from diffrigid.sysid.times import controls_over, grid
 
 LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are looked at
@@ -137,8 +137,7 @@ def known(run: Run, name: str) -> np.ndarray:
 def full_turn(run: Run, name: str) -> float:
     """What a column of angles reads after a full turn more; 0 for other columns."""
     channel = run.channels[name]
-    is_angle = isinstance(channel.observer, Part) and channel.observer.field == "angle"
-    return 2.0 * np.pi * abs(float(channel.scale)) if is_angle else 0.0
+    return 2.0 * np.pi * abs(float(channel.scale)) if is_angle(channel) else 0.0
 
 
 def _padded(array: np.ndarray, rows: int) -> np.ndarray:
@@ -195,7 +194,7 @@ def _simulated_here(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
             seen = states_at(world, states, lengths, data.controls, data.times[name] - channel.clock[None])
         else:
             seen = jax.tree.map(lambda leaf, index=data.rows[name]: _pick(leaf, index), states)
-        away = difference(channel, seen, data.measured[name]) * data.weights[name]
+        away = difference(channel, world, seen, data.measured[name]) * data.weights[name]
         rows.append(away.reshape(-1, lanes))
     return jnp.concatenate([*rows, *_prior_rows(plan, data.scene, z)]), states
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffrigid.constraints import joint_errors, placed
+from diffrigid.joint_motion import fields_of
 from diffrigid.state import rotations
 from diffrigid.sysid.diagnosis import RARE, whiteness
 from diffrigid.sysid.parameters import Scene
@@ -57,10 +58,14 @@ def _torn(scene: Scene) -> list[str]:
     if not world.joints:
         return []
     errors = np.asarray(joint_errors(rotations(world.dim), placed(world.joints, world.statics, state.x, state.q)))
-    names = [name for group in world.joint_names for name in group]
+    joints = [
+        (name, "".join(f"{name}.{field}" for field in fields_of(joint)[:1]))
+        for names, joint in zip(world.joint_names, world.joints, strict=True)
+        for name in names
+    ]
     return [
         f"the fitted start is {size:.2g} m (or rad) off the joint {name}, onto which the first step moves the bodies: "
-        "free what moves with it too, a position with an angle, anchor_b with anchor_a"
-        for name, size in zip(names, np.abs(errors).max(1), strict=True)
+        "free what moves with it too, a position with an angle, anchor_b with anchor_a" + (f", or {own}" if own else "")
+        for (name, own), size in zip(joints, np.abs(errors).max(1), strict=True)
         if size > TORN
     ]

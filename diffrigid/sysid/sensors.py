@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from diffrigid import so3
+from diffrigid import joint_motion, so3
 from diffrigid.convert import nearest, numbers, unit_quaternion
 from diffrigid.numerics import norm
 from diffrigid.pytree import Leaf, array, array_fields, map_arrays, pytree, replace, static
@@ -44,6 +44,17 @@ class Part:
         if self.field == "angle":
             return jnp.arctan2(state.q[self.body, 1:], state.q[self.body, :1])
         return getattr(state, self.field)[self.body]
+
+
+@pytree
+class JointPart:
+    """Of a joint: "hinge.angle", up to full turns, or "slider.translation", and the rate of either."""
+
+    joint: str = static()
+    field: str = static()
+
+    def __call__(self, state: State, world: World) -> Array:
+        return joint_motion.read(world, state, self.joint, self.field)[None]
 
 
 @pytree
@@ -148,18 +159,27 @@ class Channel:
     clock: Leaf = array(default=0.0)  # (*batch) [s]
 
 
-def predict(channel: Channel, states: State) -> Array:
+def predict(channel: Channel, world: World, states: State) -> Array:
     """What the instrument reads at K times, (K, size, *batch), from states with a leading axis of times."""
-    return channel.scale[None, None] * jax.vmap(channel.observer)(states) + channel.bias[None]
+    return channel.scale[None, None] * jax.vmap(partial(_seen, channel.observer, world))(states) + channel.bias[None]
 
 
-def difference(channel: Channel, states: State, measured: Array) -> Array:
+def _seen(observer: Any, world: World, state: State) -> Array:
+    return observer(state, world) if isinstance(observer, JointPart) else observer(state)
+
+
+def is_angle(channel: Channel) -> bool:
+    """Whether a column is an angle, known up to full turns."""
+    return isinstance(channel.observer, Part | JointPart) and channel.observer.field == "angle"
+
+
+def difference(channel: Channel, world: World, states: State, measured: Array) -> Array:
     """Predicted minus measured, (K, size of the residual, *batch); of angles and turns at most half a turn."""
     if _is_turn(channel):
         so, q = rotations(states.x.shape[2]), states.q[:, channel.observer.body]
         return jax.vmap(lambda measured, q: so.log(so.difference(measured, q)))(measured + jnp.zeros_like(q), q)
-    away = predict(channel, states) - measured
-    if isinstance(channel.observer, Part) and channel.observer.field == "angle":
+    away = predict(channel, world, states) - measured
+    if is_angle(channel):
         turn = away / channel.scale[None, None]
         away = channel.scale[None, None] * jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
     return away
@@ -203,7 +223,7 @@ def size_of(observer: Any, world: World) -> int:
     shapes = {name: (count, sizes[letter]) for name, letter in zip("xqvw", "DQDA", strict=True)}
     dtype = jnp.result_type(world.bodies.mass)
     leaves: dict[str, Any] = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
-    value = jax.eval_shape(observer, State(**leaves))
+    value = jax.eval_shape(partial(_seen, observer, world), State(**leaves))
     if value.ndim != 1:
         raise ValueError(f"an observer returned the shape {value.shape}, expected a number or a vector for one state")
     return value.shape[0]
@@ -214,6 +234,15 @@ def _resolved(name: str, what: Any, world: World) -> Any:
     if isinstance(what, str):
         body, _, field = what.rpartition(".") if "." in what else (what, "", "x")
         possible = [f"{b}.{f}" for b in world.names for f in FIELDS if f != "angle" or world.dim == 2]
+        of_joints = {
+            f"{j}.{f}": JointPart(joint=j, field=f)
+            for names, joint in zip(world.joint_names, world.joints, strict=True)
+            for j in names
+            for f in joint_motion.fields_of(joint)
+        }
+        if what in of_joints:
+            return of_joints[what]
+        possible += of_joints
         if f"{body}.{field}" not in possible:
             raise ValueError(
                 f"observations: no column {name!r} in this {world.dim}D world"

@@ -1,0 +1,152 @@
+"""The angle of a hinge, the translation of a slider, and their rates, as numbers that are read from a state and set.
+
+To set one moves what hangs on one side of the joint as a rigid body, against the body on the other side, and closes
+the joint where its anchors do not meet. The side moves that no other joint holds to a static or to the world; if both
+are free, that of body a.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from diffrigid.constraints import change, placed
+from diffrigid.joints import Pose, Prismatic, Revolute
+from diffrigid.linkage import ends_of, to_sides
+from diffrigid.numerics import dot
+from diffrigid.pytree import replace
+from diffrigid.state import State, rotations
+
+COORDINATE = {Revolute: "angle", Prismatic: "translation"}
+RATE = "rate"
+
+
+def fields_of(joint: Any) -> tuple[str, ...]:
+    """What can be read and set of a joint: "angle" or "translation", and "rate"."""
+    return (COORDINATE[type(joint)], RATE) if type(joint) in COORDINATE else ()
+
+
+def read(world: Any, state: State, name: str, field: str) -> Array:
+    """The angle [rad], the translation [m] or the rate [rad/s, m/s] of a joint, (*batch)."""
+    so, at = rotations(world.dim), _at(world, state, name)
+
+    def coordinate(a: Pose, b: Pose) -> Array:
+        return at.joint.coordinate(so, a, b)
+
+    return change(so, coordinate, at.a, at.b, at.twists) if field == RATE else coordinate(at.a, at.b)
+
+
+def write(world: Any, state: State, name: str, field: str, value: Array) -> State:
+    """The state, without batch axes, in which `read` gives the value. Velocities turn with the bodies."""
+    side, bodies = moving_side(world, name)
+    by, rows = value - read(world, state, name, field), jnp.array(bodies)
+    motion = _motion(world, _at(world, state, name), side, by)
+    moved = (_faster if field == RATE else _moved)(state, motion, rows)
+    return replace(state, **{leaf: getattr(state, leaf).at[rows].set(new) for leaf, new in moved.items()})
+
+
+def moving_side(world: Any, name: str) -> tuple[int, tuple[int, ...]]:
+    """Which side of a joint moves when it is set, 0 for that of a, and its bodies, that of the joint first.
+
+    No bodies if both sides hang together without the joint, so that neither moves alone.
+    """
+    index = [joint for names in world.joint_names for joint in names].index(name)
+    return _moving_side(ends_of(world.joints), index, len(world.names))
+
+
+@functools.cache
+def _moving_side(ends: tuple[tuple[int, int], ...], index: int, moving: int) -> tuple[int, tuple[int, ...]]:
+    links = [tuple(min(end, moving) for end in pair) for k, pair in enumerate(ends) if k != index]  # one ground
+    sides = [_together(min(end, moving), links) for end in ends[index]]
+    if sides[0] == sides[1]:
+        return 0, ()
+    side = 1 if moving in sides[0] else 0
+    own = ends[index][side]
+    return side, (own, *sorted(sides[side] - {own}))
+
+
+class _At(NamedTuple):
+    """A joint, and its bodies a and b."""
+
+    joint: Any
+    a: Pose
+    b: Pose
+    twists: Array  # (2, D + A, *batch)
+
+
+def _at(world: Any, state: State, name: str) -> _At:
+    group, row = next((g, names.index(name)) for g, names in enumerate(world.joint_names) if name in names)
+    (at,) = placed(world.joints[group : group + 1], world.statics, state.x, state.q)
+    twists = to_sides(ends_of(world.joints[group : group + 1]), jnp.concatenate([state.v, state.w], axis=1))
+    joint, a, b = jax.tree.map(lambda leaf: leaf[row], tuple(at))
+    return _At(joint, a, b, twists[row])
+
+
+def _together(first: int, links: list[tuple[int, ...]]) -> set[int]:
+    """What hangs together with the first."""
+    found, size = {first}, 0
+    while len(found) > size:
+        size = len(found)
+        found |= {end for link in links if found & set(link) for end in link}
+    return found
+
+
+class _Motion(NamedTuple):
+    """How one side of a joint moves against the other, the base, when its coordinate changes."""
+
+    way: Array  # (D,) [m] of the anchor along the axis of a slider, or its change of velocity
+    turn: Array  # (A,) [rad] about the axis of a hinge, or its change of angular velocity
+    along: Array | None  # (D,) axis along which the anchor may move; None: it stays on that of the base
+    anchor: Array  # (D,) [m] on the side that moves
+    own: Any  # twist (D + A,) and place (D,) of the body that it is on
+    base: Any  # likewise
+    pivot: Array  # (D,) [m] where the anchor belongs, before it moves
+
+
+def _motion(world: Any, at: _At, side: int, by: Array) -> _Motion:
+    so, joint = rotations(world.dim), at.joint
+    anchors = [pose.x + so.rotate(pose.q, anchor) for pose, anchor in ((at.a, joint.anchor_a), (at.b, joint.anchor_b))]
+    bodies = [(at.twists[0], at.a.x), (at.twists[1], at.b.x)]
+    by = by if side == 0 else -by  # of b against a
+    no_turn, pivot = jnp.zeros_like(at.twists[0, so.D :]), anchors[1 - side]
+    if isinstance(joint, Revolute):
+        axis = jnp.ones_like(no_turn) if so.D == 2 else so.rotate(at.b.q, joint.axis_b)
+        way, turn, along = jnp.zeros_like(pivot), by * axis, None
+    else:
+        along = so.rotate(at.b.q, joint.axis_b)
+        way, turn = by * along, no_turn
+        pivot = pivot + dot(along, anchors[side] - pivot) * along
+    return _Motion(way, turn, along, anchors[side], bodies[side], bodies[1 - side], pivot)
+
+
+def _moved(state: State, motion: _Motion, rows: Array) -> dict[str, Array]:
+    """The bodies `rows` with the anchor where it belongs, and moved from there; relative velocities turn with them."""
+    so = rotations(state.x.shape[1])
+    (own, own_x), (base, base_x) = motion.own, motion.base
+    turned, target = so.exp(motion.turn), motion.pivot + motion.way
+
+    def of_base(x: Array) -> Array:
+        return base[: so.D] + so.cross(base[so.D :], x - base_x)
+
+    def one(x: Array, q: Array, v: Array, w: Array) -> tuple[Array, ...]:
+        there = target + so.rotate(turned, x - motion.anchor)
+        w = base[so.D :] + (w - base[so.D :] if so.D == 2 else so.rotate(turned, w - base[so.D :]))
+        return there, so.turn_by(motion.turn, q), of_base(there) + so.rotate(turned, v - of_base(x)), w
+
+    x, q, v, w = jax.vmap(one)(state.x[rows], state.q[rows], state.v[rows], state.w[rows])
+    # The anchor moves with that of the base, but along the axis of a slider.
+    there, _, u, spin = one(own_x, state.q[rows[0]], own[: so.D], own[so.D :])
+    apart = u + so.cross(spin, target - there) - of_base(target)
+    if motion.along is not None:
+        along = so.rotate(turned, motion.along)
+        apart = apart - dot(along, apart) * along
+    return {"x": x, "q": q, "v": v - apart[None], "w": w}
+
+
+def _faster(state: State, motion: _Motion, rows: Array) -> dict[str, Array]:
+    """Velocities of the bodies `rows`, changed along the joint."""
+    so = rotations(state.x.shape[1])
+    turning = jax.vmap(so.cross, (None, 0))(motion.turn, state.x[rows] - motion.anchor[None])
+    return {"v": state.v[rows] + motion.way[None] + turning, "w": state.w[rows] + motion.turn[None]}
