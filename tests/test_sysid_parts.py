@@ -60,6 +60,23 @@ def test_every_inertia_is_one_of_some_masses():
         kind.size(())
 
 
+def test_principal_moments_of_an_inertia_change_along_axes_that_stay():
+    random, kind = np.random.default_rng(0), dr.inertia(principal=True)
+    axes = np.asarray(dr.so3.rotate(dr.so3.exp(jnp.array([0.3, -0.5, 0.8]))[:, None], jnp.eye(3)))
+    reference = jnp.asarray(axes @ np.diag([0.2, 0.3, 0.25]) @ axes.T)
+    assert kind.size((3, 3)) == 3
+    assert_allclose(kind.value(jnp.zeros(3), reference), reference, atol=1e-15)
+    for _ in range(20):
+        along = axes.T @ np.asarray(kind.value(jnp.asarray(2 * random.normal(size=3)), reference)) @ axes
+        assert_allclose(along - np.diag(np.diag(along)), 0.0, atol=1e-12)
+        principal = np.sort(np.diag(along))
+        assert principal[0] > 0 and principal[2] < principal[0] + principal[1]
+    ball = 0.1 * jnp.eye(3)
+    assert np.isfinite(jax.jacfwd(kind.value)(jnp.zeros(3), ball)).all()  # whose axes are any
+    with pytest.raises(ValueError, match="principal is 3"):
+        dr.inertia(principal=3)
+
+
 def test_shares_keep_their_sum_and_take_any_ratio():
     kind, reference = dr.shares(), jnp.array([1.0, 3.0, 4.0])
     value = kind.value(jnp.array([0.4, -1.0]), reference)

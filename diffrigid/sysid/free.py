@@ -196,15 +196,22 @@ def rotation(spread: float = 0.5) -> Chart:
     return Chart(name="rotation", size_of=_rotation_size, map=_turned, spread=_spread(spread))
 
 
-def inertia(spread: float = 0.3) -> Chart:
+def inertia(spread: float = 0.3, *, principal: bool = False) -> Chart:
     """A (3, 3) inertia that stays one of a mass distribution: {"die.inertia": inertia()}.
 
+    Args:
+        principal: True: the principal axes stay as they are, as those of a body with planes of symmetry; three numbers
+            instead of six.
+
     Example:
-        >>> flat = dr.inertia().value(jnp.array([-50.0, 0.0, 0.0, 0.0, 0.0, 0.0]), jnp.eye(3))
+        >>> flat = dr.inertia(principal=True).value(jnp.array([-50.0, 0.0, 0.0]), jnp.eye(3))
         >>> flat.diagonal().round(6).tolist()  # of a plate; none can be larger than the sum of the others
         [1.0, 0.5, 0.5]
     """
-    return Chart(name="inertia", size_of=_inertia_size, map=_physical_inertia, spread=_spread(spread))
+    if not isinstance(principal, bool):
+        raise ValueError(f"inertia: principal is {principal!r}, expected True or False")
+    size_of, physical = (_moments_size, _principal_moments) if principal else (_inertia_size, _physical_inertia)
+    return Chart(name="inertia", size_of=size_of, map=physical, spread=_spread(spread))
 
 
 def shares(spread: float = 0.5) -> Chart:
@@ -288,22 +295,38 @@ def _inertia_size(shape: tuple[int, ...]) -> int:
     return 6
 
 
+def _moments_size(shape: tuple[int, ...]) -> int:
+    return _inertia_size(shape) // 2
+
+
+def _second_moments(inertia: Array) -> Array:
+    """S = integral of r r^T dm, of which I = tr(S) 1 - S."""
+    return 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=inertia.dtype) - inertia
+
+
+def _inertia_of(moments: Array) -> Array:
+    return jnp.trace(moments) * jnp.eye(3, dtype=moments.dtype) - moments
+
+
+def _principal_moments(z: Array, reference: Array) -> Array:
+    """The second moments S along their own axes, each times exp(z)."""
+    sizes, axes = jnp.linalg.eigh(_second_moments(reference))
+    return _inertia_of((axes * (sizes * jnp.exp(z))[None]) @ axes.T)
+
+
 def _physical_inertia(z: Array, reference: Array) -> Array:
-    """With the second moments S = integral of r r^T dm, I = tr(S) 1 - S is physical if S is positive definite.
+    """With the second moments S, I = tr(S) 1 - S is physical if S is positive definite.
 
     S = C T T^T C^T with the Cholesky factor C of that of the reference and T lower triangular, exp(z) on its diagonal.
     Source: Wensing, Kim, Slotine, Linear Matrix Inequalities for Physically Consistent Inertial Parameters, 2018.
     """
-    eye = jnp.eye(3, dtype=z.dtype)
-    moments = 0.5 * jnp.trace(reference) * eye - reference
     zero = jnp.zeros_like(z[0])
     scale = jnp.exp(z[:3])
     factor = jnp.stack(
         [jnp.stack(row) for row in ([scale[0], zero, zero], [z[3], scale[1], zero], [z[4], z[5], scale[2]])]
     )
-    half = jnp.linalg.cholesky(moments) @ factor
-    moments = half @ half.T
-    return jnp.trace(moments) * eye - moments
+    half = jnp.linalg.cholesky(_second_moments(reference)) @ factor
+    return _inertia_of(half @ half.T)
 
 
 def _shares_size(shape: tuple[int, ...]) -> int:
