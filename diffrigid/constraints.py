@@ -18,7 +18,7 @@ from diffrigid.joints import Pose
 from diffrigid.pytree import replace
 
 
-class Placed(NamedTuple):
+class PlacedJoints(NamedTuple):
     """Joints of one kind, without names, and the poses of their bodies; every leaf with a leading axis M."""
 
     joint: Any
@@ -26,14 +26,14 @@ class Placed(NamedTuple):
     b: Pose
 
 
-def placed(joints: tuple, statics: Any, x: Array, q: Array) -> tuple[Placed, ...]:
+def placed(joints: tuple, statics: Any, x: Array, q: Array) -> tuple[PlacedJoints, ...]:
     """All joints of a world whose bodies have poses x (N, D, *batch), q (N, Q, *batch)."""
     every = _poses(statics, x, q)
 
     def at(ends: tuple[int, ...]) -> Pose:
         return Pose(rows(every.x, ends), rows(every.q, ends))
 
-    return tuple(Placed(replace(group, a=None, b=None), at(group.a), at(group.b)) for group in joints)
+    return tuple(PlacedJoints(replace(group, a=None, b=None), at(group.a), at(group.b)) for group in joints)
 
 
 def _poses(statics: Any, x: Array, q: Array) -> Pose:
@@ -44,7 +44,7 @@ def _poses(statics: Any, x: Array, q: Array) -> Pose:
     return Pose(*(jnp.concatenate(parts) for parts in zip((x, q), still, world, strict=True)))
 
 
-def of_each(row: Callable, groups: tuple[Placed, ...], *args: Array) -> Array:
+def of_each(row: Callable, groups: tuple[PlacedJoints, ...], *args: Array) -> Array:
     """`row(joint, a, b, *args)` of all n joints for args (n, ...), (n, E, *batch), filled up with zeros to E rows."""
     parts, start = [], 0
     for group in groups:
@@ -88,17 +88,17 @@ def _held(so: ModuleType, joint: Any) -> Callable:
     return lambda a, b: joint(so, a, b)
 
 
-def joint_errors(so: ModuleType, groups: tuple[Placed, ...]) -> Array:
+def joint_errors(so: ModuleType, groups: tuple[PlacedJoints, ...]) -> Array:
     """(n, E, *batch) [m or rad]."""
     return of_each(lambda joint, a, b: joint(so, a, b), groups)
 
 
-def joint_rates(so: ModuleType, groups: tuple[Placed, ...], twists: Array) -> Array:
+def joint_rates(so: ModuleType, groups: tuple[PlacedJoints, ...], twists: Array) -> Array:
     """J u for the twists u of the bodies of all joints, (n, 2, D + A, *batch) -> (n, E, *batch) [m/s or rad/s]."""
     return of_each(lambda joint, a, b, u: change(so, _held(so, joint), a, b, u), groups, twists)
 
 
-def joint_accelerations(so: ModuleType, groups: tuple[Placed, ...], twists: Array, rates: Array) -> Array:
+def joint_accelerations(so: ModuleType, groups: tuple[PlacedJoints, ...], twists: Array, rates: Array) -> Array:
     """J du + dJ/dt u for twists u that change at rates du, (n, E, *batch) [m/s^2 or rad/s^2]."""
 
     def row(joint: Any, a: Pose, b: Pose, u: Array, du: Array) -> Array:
@@ -107,14 +107,14 @@ def joint_accelerations(so: ModuleType, groups: tuple[Placed, ...], twists: Arra
     return of_each(row, groups, twists, rates)
 
 
-def joint_jacobian(so: ModuleType, groups: tuple[Placed, ...]) -> Array:
+def joint_jacobian(so: ModuleType, groups: tuple[PlacedJoints, ...]) -> Array:
     """J by blocks, one for each of the two bodies of each joint, (n, E, 2, D + A, *batch)."""
     flat = of_each(lambda joint, a, b: by_twists(so, _held(so, joint), a, b), groups)
     return flat.reshape(*flat.shape[:2], 2, so.D + so.A, *flat.shape[3:])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def joint_forces(so: ModuleType, sides: Array, groups: tuple[Placed, ...], lam: Array) -> Array:
+def joint_forces(so: ModuleType, sides: Array, groups: tuple[PlacedJoints, ...], lam: Array) -> Array:
     """J^T lam on the two bodies of each joint, (n, 2, D + A, *batch), for multipliers (n, E, *batch).
 
     Args:

@@ -23,7 +23,7 @@ from diffrigid.hull import hull_faces
 from diffrigid.pytree import replace
 from diffrigid.shapes import UNEVEN, Box, HalfSpace, Hull, edges, radius, vertices
 from diffrigid.state import Bodies, State, Wrench, momentum, spin
-from diffrigid.touch import Side, gaps, rotated
+from diffrigid.touch import Convex, gaps, rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.world import World
 
@@ -54,7 +54,7 @@ class Touch(NamedTuple):
     point: np.ndarray  # (M, D) [m]
 
 
-class Motion(NamedTuple):
+class Sampled(NamedTuple):
     """All colliders at the times looked at; those that do not move have no velocity."""
 
     t: np.ndarray  # (T+1,) [s]
@@ -133,7 +133,7 @@ def _thinned(trajectory: Trajectory) -> Trajectory:
     return replace(trajectory, t=t, state=state, controls=controls)
 
 
-def _motion(trajectory: Trajectory) -> Motion:
+def _motion(trajectory: Trajectory) -> Sampled:
     state, still = trajectory.state, trajectory.world.statics
     count, steps = len(trajectory.world.static_names), len(trajectory.t)
 
@@ -141,7 +141,7 @@ def _motion(trajectory: Trajectory) -> Motion:
         return np.concatenate([moving, np.broadcast_to(rest, (steps, count, moving.shape[2]))], axis=1)
 
     x, q = (joined(*both) for both in ((state.x, np.asarray(still.x, float)), (state.q, np.asarray(still.q, float))))
-    return Motion(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0))
+    return Sampled(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0))
 
 
 def _changes(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -172,7 +172,7 @@ def _momenta(forces: tuple, bodies: Bodies, states: State, controls: Any) -> tup
     return p, L, jax.tree.map(lambda a, b: 0.5 * (a + b), *at_ends)
 
 
-def _touches(world: World, group: Any, motion: Motion, dp: np.ndarray, dL: np.ndarray, push: np.ndarray) -> Touch:
+def _touches(world: World, group: Any, motion: Sampled, dp: np.ndarray, dL: np.ndarray, push: np.ndarray) -> Touch:
     """Contacts of all pairs of one kind."""
     sides = _side(world, group.shape_a), _side(world, group.shape_b)
     a, b, rows = np.array(group.a), np.array(group.b), (np.array(group.row_a), np.array(group.row_b))
@@ -204,7 +204,7 @@ def _touches(world: World, group: Any, motion: Motion, dp: np.ndarray, dL: np.nd
     return Touch(k[row], s[row], new[row], a[pair[row]], b[pair[row]], point[row, c])
 
 
-def _side(world: World, group: int) -> Side:
+def _side(world: World, group: int) -> Convex:
     """Corners, edges and faces of the rows of one entry of `world.shapes`, from the centres of their bodies."""
     records, offset, dim = world.shapes[group], world.offsets[group], world.dim
     shapes = [
@@ -212,7 +212,7 @@ def _side(world: World, group: int) -> Side:
     ]
     if isinstance(records, HalfSpace):
         normal = np.asarray(records.normal, float)
-        return Side(None, normal, np.asarray(records.offset, float), (), (), np.full(len(normal), np.inf))
+        return Convex(None, normal, np.asarray(records.offset, float), (), (), np.full(len(normal), np.inf))
     corners = np.array([vertices(shape, dim) for shape in shapes], float)
     corners = corners if offset is None else corners + np.asarray(offset.r, float)[:, None]
     rounding = np.array([radius(shape) for shape in shapes], float)
@@ -223,7 +223,7 @@ def _side(world: World, group: int) -> Side:
     else:
         sides = edges(shapes[0], dim) or ((0, 0),)
         faces = (records.faces or ()) if isinstance(records, Hull) else _box_faces() if count > 3 else ()
-    return Side(corners, None, rounding, sides, faces, np.linalg.norm(corners, axis=2).max(1) + rounding)
+    return Convex(corners, None, rounding, sides, faces, np.linalg.norm(corners, axis=2).max(1) + rounding)
 
 
 @functools.cache
@@ -232,7 +232,7 @@ def _box_faces() -> tuple:
     return tuple(hull_faces(np.array(vertices(Box(half=(1.0, 1.0, 1.0)), 3), float)))
 
 
-def _flown(motion: Motion, k: np.ndarray, body: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _flown(motion: Sampled, k: np.ndarray, body: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Poses (M, D), (M, Q) after a free flight of s (M,) without forces, which is near enough within an interval."""
     x, q, w = motion.x[k, body] + s[:, None] * motion.v[k, body], motion.q[k, body], s[:, None] * motion.w[k, body]
     if q.shape[1] == 2:
@@ -267,7 +267,7 @@ def _repeated(point: np.ndarray, near: np.ndarray, distance: np.ndarray) -> np.n
     return repeated
 
 
-def _impulses(world: World, motion: Motion, touch: Touch, dp: np.ndarray, dL: np.ndarray) -> np.ndarray:
+def _impulses(world: World, motion: Sampled, touch: Touch, dp: np.ndarray, dL: np.ndarray) -> np.ndarray:
     """Impulses (M, D) [N s] on collider a (b receives the opposite), the least that explain the changes of momentum."""
     found, moving = np.zeros_like(touch.point), len(world.names)
     change, order = np.concatenate([dp, dL], axis=2), np.argsort(touch.interval, kind="stable")
@@ -319,7 +319,7 @@ def _moments(r: np.ndarray) -> np.ndarray:
     return np.array([[-r[1], r[0]]]) if len(r) == 2 else np.cross(r, np.eye(3)).T
 
 
-def _anchors(world: World, motion: Motion, k: int, group: Any) -> tuple[np.ndarray, np.ndarray]:
+def _anchors(world: World, motion: Sampled, k: int, group: Any) -> tuple[np.ndarray, np.ndarray]:
     """Bodies (2, J) of the joints of one kind, and arms (2, J, D) [m] from their centres to the anchors."""
     a, anchor = np.array(group.a), np.asarray(group.anchor_a, float)
     arm_a = rotated(motion.q[k, a], anchor)

@@ -20,7 +20,7 @@ from jax import Array, lax
 
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.constraints import (
-    Placed,
+    PlacedJoints,
     by_twists,
     joint_accelerations,
     joint_errors,
@@ -61,7 +61,7 @@ def ends_of(joints: Any) -> tuple[tuple[int, int], ...]:
 class Linkage:
     """How the n joints of a world act on its N moving bodies."""
 
-    groups: tuple[Placed, ...] = ()
+    groups: tuple[PlacedJoints, ...] = ()
     sides: Array = array("n", "E", "2", "D + A")  # J, without derivative
     factors: tuple[Factor, ...] = ()  # of J M^-1 J^T, without derivative
     inverse_mass: Array = array("N")  # [1/kg]
@@ -177,7 +177,7 @@ def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wren
     gyroscopic = jax.vmap(so.gyroscopic)(bodies.inertia, state.q, state.w)
     free = _moved(link, given - jnp.pad(gyroscopic, [(0, 0), (so.D, 0), *[(0, 0)] * (given.ndim - 2)]))
 
-    def falling(groups: tuple[Placed, ...], twists: Array, free: Array) -> Array:
+    def falling(groups: tuple[PlacedJoints, ...], twists: Array, free: Array) -> Array:
         return joint_accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
 
     target = unfused(opaque_true(state.x), falling, link.groups, _twists(state), free)

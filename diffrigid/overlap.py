@@ -15,7 +15,7 @@ from diffrigid.shapes import HalfSpace, edges, radius, vertices
 from diffrigid.touch import rotated
 
 
-class Placed(NamedTuple):
+class Outline(NamedTuple):
     """A collider in the world; V corners, E edges."""
 
     corners: np.ndarray  # (V, D) [m]; of a half space (1, D), a point of its surface
@@ -32,14 +32,14 @@ class Placed(NamedTuple):
         return np.linalg.norm(self.corners - self.corners.mean(0), axis=1).max() + self.rounding
 
 
-def place(shape: Any, x: np.ndarray, q: np.ndarray, center: np.ndarray) -> Placed:
+def place(shape: Any, x: np.ndarray, q: np.ndarray, center: np.ndarray) -> Outline:
     """A shape of which the point `center` is at x (D,) [m], with orientation q."""
     dim = len(x)
     x = x - rotated(q, np.asarray(center))
     if isinstance(shape, HalfSpace):
         normal = rotated(q, np.asarray(shape.normal))
         none = np.zeros((0, dim))
-        return Placed((x + shape.offset * normal)[None], none, none, 0.0, normal)
+        return Outline((x + shape.offset * normal)[None], none, none, 0.0, normal)
     corners = x + rotated(q, known(lambda s: vertices(s, dim), shape))
     if dim == 3:
         pairs = edges(shape, dim)
@@ -47,10 +47,10 @@ def place(shape: Any, x: np.ndarray, q: np.ndarray, center: np.ndarray) -> Place
         pairs = tuple((i, (i + 1) % len(corners)) for i in range(len(corners)) if len(corners) > 1)
     ends = np.array(pairs, int).reshape(-1, 2)
     starts = corners[ends[:, 0]]
-    return Placed(corners, corners[ends[:, 1]] - starts, starts, float(known(radius, shape)), None)
+    return Outline(corners, corners[ends[:, 1]] - starts, starts, float(known(radius, shape)), None)
 
 
-def separation(a: Placed, b: Placed) -> float:
+def separation(a: Outline, b: Outline) -> float:
     """Signed distance [m], negative in penetration. One of the two may be a half space."""
     for solid, other in ((a, b), (b, a)):
         if solid.normal is not None:
@@ -64,7 +64,7 @@ def separation(a: Placed, b: Placed) -> float:
     return apart.max(initial=-scale) - a.rounding - b.rounding
 
 
-def _directions(a: Placed, b: Placed) -> np.ndarray:
+def _directions(a: Outline, b: Outline) -> np.ndarray:
     """Candidates for the direction of the closest approach, of any length, (M, D)."""
     dim = a.corners.shape[1]
     between = (a.corners[:, None] - b.corners[None]).reshape(-1, dim)
@@ -75,14 +75,14 @@ def _directions(a: Placed, b: Placed) -> np.ndarray:
     return np.concatenate([between, np.cross(sides[i], sides[j]), _across(a, b), _across(b, a)])
 
 
-def _across(a: Placed, b: Placed) -> np.ndarray:
+def _across(a: Outline, b: Outline) -> np.ndarray:
     """From each edge of b to each corner of a, at right angles to the edge."""
     to = a.corners[:, None] - b.starts[None]
     share = (to * b.sides).sum(2) / (b.sides**2).sum(1)
     return (to - share[:, :, None] * b.sides).reshape(-1, 3)
 
 
-def overlapping(colliders: dict[int, Placed], pairs: list, margin: float) -> list[tuple[int, int]]:
+def overlapping(colliders: dict[int, Outline], pairs: list, margin: float) -> list[tuple[int, int]]:
     """Those pairs (i, j) of keys of `colliders` that penetrate by more than `margin` of the smaller size."""
     size = {key: collider.size for key, collider in colliders.items()}
     centre = {key: collider.corners.mean(0) for key, collider in colliders.items()}
@@ -94,7 +94,7 @@ def overlapping(colliders: dict[int, Placed], pairs: list, margin: float) -> lis
     return deep
 
 
-def near_pairs(colliders: dict[int, Placed], moving: int) -> list[tuple[int, int]]:
+def near_pairs(colliders: dict[int, Outline], moving: int) -> list[tuple[int, int]]:
     """All pairs that may overlap: round ones in one cell of a grid, or in two that touch, and those with half-spaces.
 
     The first of each is below `moving`.

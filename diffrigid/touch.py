@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Side(NamedTuple):
+class Convex(NamedTuple):
     """R shapes of one kind, in body axes from the centres of their bodies; a half space has no corners."""
 
     corners: np.ndarray | None  # (R, V, D) [m]
@@ -19,7 +19,7 @@ class Side(NamedTuple):
     faces: tuple  # triples of corners, counter-clockwise from outside
     size: np.ndarray  # (R,) [m] radius that holds it
 
-    def take(self, rows: np.ndarray) -> "Side":
+    def take(self, rows: np.ndarray) -> "Convex":
         """Those of some rows."""
         return self._replace(
             corners=None if self.corners is None else self.corners[rows],
@@ -31,7 +31,7 @@ class Side(NamedTuple):
 Pose = tuple[np.ndarray, np.ndarray]
 
 
-def gaps(a: Side, pose_a: Pose, b: Side, pose_b: Pose) -> tuple[np.ndarray, np.ndarray]:
+def gaps(a: Convex, pose_a: Pose, b: Convex, pose_b: Pose) -> tuple[np.ndarray, np.ndarray]:
     """Signed gaps (M, C) [m] and points (M, C, D) of C candidates for a contact, M poses."""
     if a.corners is None:
         return gaps(b, pose_b, a, pose_a)
@@ -71,7 +71,7 @@ def rotated(q: np.ndarray, r: np.ndarray) -> np.ndarray:
     return r + q[..., :1] * t + np.cross(q[..., 1:], t)
 
 
-def _on_plane(a: Side, corners: np.ndarray, b: Side, pose: Pose):
+def _on_plane(a: Convex, corners: np.ndarray, b: Convex, pose: Pose):
     assert b.normal is not None
     normal = rotated(pose[1], b.normal)
     gap = ((corners - pose[0][:, None]) * normal[:, None]).sum(2) - (b.rounding + a.rounding)[:, None]

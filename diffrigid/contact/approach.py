@@ -150,7 +150,7 @@ def _least(times: Array) -> Array:
     return fold(jnp.minimum, times, 0) if len(times) <= MANY else times.min(0)
 
 
-def turn_rate(side: Side) -> Array:
+def angular_speed(side: Side) -> Array:
     """Angular speed where its path begins, (*batch) [rad/s]."""
     f = side.flight
     if f is None:
@@ -168,7 +168,7 @@ def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
     if f is None:
         return jnp.zeros_like(span), jnp.zeros_like(span)
     so, reach = rotations(f.dim), reach_of(side)
-    w, a = turn_rate(side), norm(f.a)
+    w, a = angular_speed(side), norm(f.a)
     jerk = 8.0 * w * w * w * reach
     if f.jerk is not None:
         a, jerk = a + span * norm(f.jerk), jerk + norm(f.jerk)

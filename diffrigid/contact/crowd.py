@@ -71,7 +71,7 @@ class Walls:
     number: Array  # (R,) int, from M on
 
 
-class Next(NamedTuple):
+class Encounters(NamedTuple):
     """The impacts of a round: E bodies, or fewer, and what each meets."""
 
     a: Array  # (E,) int
@@ -189,7 +189,7 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
     return lax.scan(maybe, (start, jnp.asarray(True)), length=ROUNDS * crowd.world.contact.sweeps)[0][0]
 
 
-def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Next:
+def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Encounters:
     """The impacts that are next for both their sides, as many as there is room for."""
     count, dt = len(near.found), lax.stop_gradient(crowd.dt)
     speed, eps, rest_speed = norm(bodies.flight.v), jnp.finfo(dt.dtype).eps, crowd.world.contact.rest_speed
@@ -225,10 +225,10 @@ def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Next:
     ranks = jnp.cumsum(lead.astype(jnp.int32))
     slot = lax.broadcasted_iota(jnp.int32, (-(-count // SHARE),), 0)
     a = jnp.minimum(jnp.searchsorted(ranks, slot + 1).astype(jnp.int32), count - 1)
-    return Next(a, pick(other, a), slot < ranks[-1])
+    return Encounters(a, pick(other, a), slot < ranks[-1])
 
 
-def _meet(crowd: Crowd, walls: list[Walls], following: Next, bodies: Side, anchors: Anchors) -> Anchors:
+def _meet(crowd: Crowd, walls: list[Walls], following: Encounters, bodies: Side, anchors: Anchors) -> Anchors:
     """The anchors after the impacts of a round."""
     (a, b, there), count = following, anchors.t0.shape[1]
     moves = there & (b < count)

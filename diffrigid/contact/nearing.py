@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.branches import choose
-from diffrigid.contact.approach import Task, turn_rate
+from diffrigid.contact.approach import Task, angular_speed
 from diffrigid.contact.gaps import Gaps, deepest
 from diffrigid.numerics import safe_divide, safe_sqrt, softplus
 
@@ -102,7 +102,10 @@ def nearer(task: Task, now: Nearing, gaps: Gaps) -> Nearing:
     again = ~first & (closes == now.closed)  # a second time: else false position would come near from one side only
     kept = jnp.where(again, 0.5 * now.kept, 1.0)
     step = jnp.where(first, FIRST * task.span, 2.0 * now.step)
-    for rate, most in ((turn_rate(task.a) + turn_rate(task.b), TURN), (-here.rate, _ahead(here.gap, task.width))):
+    for rate, most in (
+        (angular_speed(task.a) + angular_speed(task.b), TURN),
+        (-here.rate, _ahead(here.gap, task.width)),
+    ):
         step = jnp.where(rate > 0, jnp.minimum(step, most / jnp.maximum(rate, task.slack)), step)
     root = jnp.clip(_root(closing, opening, closes, kept), closing.t + within, opening.t - within)
     following = jnp.where(between, root, jnp.where(closes, now.t + step, task.start))

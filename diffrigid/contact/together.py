@@ -63,7 +63,7 @@ def _yielded(cone: Cone, P: Array) -> Array:
     return _compliance(P) * cone.scale[:, None] * P
 
 
-class Search(NamedTuple):
+class Newton(NamedTuple):
     """How far Newton's method has come in every world of a batch."""
 
     count: Any  # int: rounds
@@ -103,7 +103,7 @@ def _solutions(
         z, r = _missing(P, *at_guess)
         error = _speed(cone, r)
         no = error < 0
-        start = Search(0, no, guess, no, z, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
+        start = Newton(0, no, guess, no, z, P, z, r, P, error, jnp.zeros_like(error, np.int32), error)
 
         def again(now):
             now = _made_rigid(cone, now)
@@ -118,7 +118,7 @@ def _solutions(
     return lax.cond(shared, solved, lambda guess: (jnp.zeros_like(guess),) * 2, guess)
 
 
-def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
+def _again(now: Newton, given: tuple[Cone, Array, Arms, Mobility]) -> Newton:
     """A Newton step, from which P is brought back into the cones.
 
     Where it gains little
@@ -168,23 +168,23 @@ def _again(now: Search, given: tuple[Cone, Array, Arms, Mobility]) -> Search:
         return jnp.where(left, to, z), jnp.where(left, along, r)
 
     at, r = lax.cond(any_world(again), beyond, lambda z, r: (z, r), z, r)
-    return Search(
+    return Newton(
         now.count + 1, now.rigid, now.rest, again, at, P, z, r, best, jnp.minimum(size, now.error), since, mark
     )  # fmt: skip
 
 
-def _yields(cone: Cone, now: Search) -> Array:
+def _yields(cone: Cone, now: Newton) -> Array:
     """Whether the compliant solution is found, and yields to more than rounding, (*batch) bool."""
     found = ~now.rigid & ~_lacks(cone, now) & (_speed(cone, now.r) <= now.error)
     yielded = _compliance(now.P) * _speed(cone, now.P - now.rest)
     return found & (yielded > 16.0 * jnp.finfo(now.P.dtype).eps * _speed(cone, now.P) + _least(cone))
 
 
-def _made_rigid(cone: Cone, now: Search) -> Search:
+def _made_rigid(cone: Cone, now: Newton) -> Newton:
     """Where what yields is found, nothing yields any more: the solution then is next to it."""
     found = _yields(cone, now)
 
-    def rigid(now: Search) -> Search:
+    def rigid(now: Newton) -> Newton:
         z = now.z + _compliance(now.P) * (now.P - now.rest)
         r = allowed(cone, z) - now.P
         error, none = _speed(cone, r), jnp.zeros_like(now.since)
@@ -195,7 +195,7 @@ def _made_rigid(cone: Cone, now: Search) -> Search:
 
 
 def _elsewhere(
-    now: Search, given: tuple[Cone, Array, Arms, Mobility], lost: Array, P: Array, z: Array, r: Array, since: Array
+    now: Newton, given: tuple[Cone, Array, Arms, Mobility], lost: Array, P: Array, z: Array, r: Array, since: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Another start, by the method of multipliers, in worlds that are `lost`."""
     cone = given[0]
@@ -244,7 +244,7 @@ def _least(cone: Cone) -> Array:
     return jnp.finfo(cone.scale.dtype).eps ** 0.6 * cone.rest_speed
 
 
-def _lacks(cone: Cone, now: Search) -> Array:
+def _lacks(cone: Cone, now: Newton) -> Array:
     """Whether the best is not yet as good as rounding allows, (*batch) bool: the longer it takes, the less is asked.
 
     Beside the compliant solution another one is soon found, or not at all.
@@ -257,7 +257,7 @@ def _lacks(cone: Cone, now: Search) -> Array:
     return now.error > small * _speed(cone, now.best) + _least(cone)
 
 
-def _circles(cone: Cone, now: Search) -> Array:
+def _circles(cone: Cone, now: Newton) -> Array:
     """Whether the error of the best is more than of rounding, (*batch) bool."""
     return now.error > 3.0 * jnp.finfo(now.P.dtype).eps ** 0.5 * _speed(cone, now.best) + _least(cone)
 
