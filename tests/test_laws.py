@@ -128,6 +128,42 @@ def test_energy_never_rises(dim):
     assert rise.max() < (PUSHED if dim == 2 else SPIN_SERIES)
 
 
+GROUND = {  # below y = 0, or z = 0
+    "box": (2, dr.Box(half=(3.0, 0.5)), (0.0, -0.5)),
+    "polygon": (2, dr.Polygon(vertices=((-3.0, -1.0), (3.0, -1.0), (3.0, 0.0), (-3.0, 0.0))), (0.0, 0.0)),
+    "profile": (2, dr.Profile(points=((-3.0, 0.0), (0.5, 0.0), (3.0, 0.0))), (0.0, 0.0)),
+    "box in space": (3, dr.Box(half=(3.0, 3.0, 0.5)), (0.0, 0.0, -0.5)),
+    "height field": (3, dr.HeightField(heights=np.zeros((3, 3)), spacing=1.0), (-1.2, -1.2, 0.0)),
+}
+
+
+@pytest.mark.parametrize("kind", GROUND)
+def test_what_is_round_and_smooth_strikes_as_if_it_did_not_spin(kind):
+    """Slow impacts of a fast spin: w^2 r is far above gravity."""
+    dim, shape, at = GROUND[kind]
+    round_shape, up = (dr.Disc if dim == 2 else dr.Sphere)(radius=0.15), np.eye(dim)[dim - 1]
+    ball, ground = dr.Body(round_shape, mass=0.9, x=0.2 * up), dr.Static(shape, x=at)
+    world, state = dr.scene({"ball": ball, "ground": ground}, gravity=-9.81 * up, restitution=0.6)
+
+    def after(gap, speed, spin):
+        w = jnp.stack([spin] if dim == 2 else [spin, -0.3 * spin, spin])
+        start = dr.replace(state, x=((0.15 + gap) * up)[None], v=(speed * up)[None], w=w[None])
+        end = dr.step(world, start, 1 / 120)
+        return jnp.stack([end.x[0] @ up, end.v[0] @ up])
+
+    gap, speed = jnp.array([2e-4, 1e-3, 5e-5]), jnp.array([-0.0346, -0.2, -0.02])
+    both = jax.jit(
+        jax.vmap(jax.vmap(lambda *z: jax.jvp(after, z, (1.0, 0.3, 0.0)), (0, 0, None)), (None, None, 0)),
+        compiler_options=dr.QUICK,
+    )
+    ends, slopes = both(gap, speed, jnp.array([0.0, 15.0, 40.0]))
+    for leaf in (ends, slopes):
+        assert_allclose(leaf, np.broadcast_to(leaf[0], leaf.shape), atol=ROUNDING)
+    s = (speed + np.sqrt(speed**2 + 2 * 9.81 * gap)) / 9.81  # of the fall to the ground
+    rebound = 0.6 * np.sqrt(speed**2 + 2 * 9.81 * gap) - 9.81 * (1 / 120 - s)
+    assert_allclose(ends[2, :2, 1], rebound[:2], atol=ROUNDING)  # the third comes down again
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_swapping_bodies_swaps_their_motions(dim):
     """Each pair then has its sides a and b exchanged."""

@@ -12,7 +12,7 @@ from jax import Array, lax
 from diffrigid.branches import any_world
 from diffrigid.collide.heights import height_over, unseen_for
 from diffrigid.contact.gaps import NEAR, Gaps
-from diffrigid.contact.sides import Side, centre, earliest, reach_of
+from diffrigid.contact.sides import Side, centre, core_reach_of, earliest, reach_of
 from diffrigid.gathers import MANY, fold
 from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.shapes import HeightField
@@ -111,6 +111,7 @@ class Polish(NamedTuple):
     """A step along the parabola of the first gap to close, and what was seen before it."""
 
     dt: Array  # (*batch) [s] until the first contact that does not rest comes to its level; 0 if none does
+    closes: Array  # (*batch) bool: it does; else it may turn back then
     at_level: Array  # (*batch) bool: some contact is there
     inside: Array  # (*batch) bool: some contact is within its level, and closing
 
@@ -120,7 +121,7 @@ class Polish(NamedTuple):
 
     def found(self, task: Task) -> Array:
         """(*batch) bool. The last step closes the gap, which at its start may have been wider than the slack."""
-        return self.at_level | ((self.dt != 0) & self.converged(task))
+        return self.at_level | (self.closes & self.converged(task))
 
 
 def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Polish:
@@ -128,11 +129,17 @@ def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Poli
     (gap, v, acc, _), slack, level = gaps, task.slack, level[None]
     height = gap - level
     there = (jnp.abs(height) <= 8.0 * slack**2 * task.size[None]) & (v < 0)  # to rounding
-    dt = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
-    within = (dt < 0) | (s < task.t1 + slack * task.span)  # what is later is no impact
+    closing = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
+    dt = closing
+    if gaps.normal is not None:  # which turns: that the gap opens again is only known after a look at where it would
+        opens = (v < 0) & (height > 0) & (v * v < 2.0 * acc * height) & ~rests
+        dt = jnp.minimum(dt, _least(jnp.where(opens, safe_divide(-v, acc), jnp.inf)))
+    # What is later is no impact; that a step leads a little beyond the end does not tell yet.
+    within = (dt < 0) | ((s < task.t1 + slack * task.span) & (s + dt < task.t1 + task.span))
     at_level = (gap <= level + (slack * task.size)[None]) & ((v < 0) | (acc < 0)) & ~rests
     inside = (gap <= level) & (v < 0) & ~rests
-    return Polish(jnp.where(jnp.isfinite(dt) & within, dt, 0.0), at_level.any(0), inside.any(0))
+    dt = jnp.where(jnp.isfinite(dt) & within, dt, 0.0)
+    return Polish(dt, (dt == closing) & (dt != 0), at_level.any(0), inside.any(0))
 
 
 def _time_to(height: Array, v: Array, acc: Array) -> Array:
@@ -167,7 +174,7 @@ def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
     f = side.flight
     if f is None:
         return jnp.zeros_like(span), jnp.zeros_like(span)
-    so, reach = rotations(f.dim), reach_of(side)
+    so, reach = rotations(f.dim), core_reach_of(side)
     w, a = angular_speed(side), norm(f.a)
     jerk = 8.0 * w * w * w * reach
     if f.jerk is not None:

@@ -31,10 +31,12 @@ def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
         return _gaps_of_corners(a, at_a, b)
     contacts = candidates_of(a, at_a, b, at_b)
 
-    def pull(n, p):
-        return dot(n, relative_acceleration(at_a, at_b, p))
+    def pull(n: Array, p: Array, gap: Array) -> Array:
+        # Of the cores: where they are rounded, other material comes to the contact as they spin.
+        at_cores = (p + (0.5 * gap + radius(a.shape))[None] * n, p - (0.5 * gap + radius(b.shape))[None] * n)
+        return dot(n, relative_acceleration(at_a, at_b, *at_cores))
 
-    acceleration = jax.vmap(pull)(contacts.normal, contacts.point)
+    acceleration = jax.vmap(pull)(contacts.normal, contacts.point, contacts.gap)
     return Gaps(contacts.gap, gap_rates(contacts, at_a, at_b), acceleration, contacts.normal)
 
 

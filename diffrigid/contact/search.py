@@ -107,7 +107,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
         look = polish(task, gaps_at(task.a, task.b, s, live), rests, level, s)
         return count + 1, s + look.dt, look._replace(inside=jnp.where(count == 0, look.inside, before.inside))
 
-    _, s, look = lax.while_loop(polishing, along, (0, near, Polish(jnp.zeros_like(near), no, no)))
+    _, s, look = lax.while_loop(polishing, along, (0, near, Polish(jnp.zeros_like(near), no, no, no)))
     return Found(s, near, look.found(task), look.inside, rests, None if task.width is None else nearest)
 
 

@@ -18,7 +18,7 @@ from diffrigid.flight import Flight, angular_momentum, orientation, position, ve
 from diffrigid.gathers import fold, rows, sum_rows
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
-from diffrigid.shapes import BOUNDLESS, HeightField
+from diffrigid.shapes import BOUNDLESS, HeightField, radius
 from diffrigid.state import rotations
 
 
@@ -133,8 +133,8 @@ def relative_velocity(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) ->
     return _difference(lambda at, arm: at.v + cross(at.w, arm), at_a, arm_a, at_b, arm_b)
 
 
-def relative_acceleration(at_a: Placed, at_b: Placed, point: Array) -> Array:
-    """Acceleration of a against b at a world point, a + dw x r + w x (w x r) of each, (D, *batch) [m/s^2].
+def relative_acceleration(at_a: Placed, at_b: Placed, point_a: Array, point_b: Array) -> Array:
+    """Acceleration of a at a world point against b at another, a + dw x r + w x (w x r) of each, (D, *batch) [m/s^2].
 
     It steers the search for an impact, no more, and so need not be exact.
     """
@@ -143,7 +143,7 @@ def relative_acceleration(at_a: Placed, at_b: Placed, point: Array) -> Array:
         cross = rotations(arm.shape[0]).cross
         return at.a + cross(at.dw, arm) + cross(at.w, cross(at.w, arm))
 
-    return _difference(one, at_a, point - at_a.x, at_b, point - at_b.x)
+    return _difference(one, at_a, point_a - at_a.x, at_b, point_b - at_b.x)
 
 
 def _difference(of, at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
@@ -177,6 +177,11 @@ def moving_along(side: Side, at: Placed, s: Array) -> Placed:
 
     v, w = jax.jvp(path, (s,), (jnp.ones_like(s),))[1]
     return replace(at, v=v, w=so.rotate(at.q, w) if so.D == 3 else w)
+
+
+def core_reach_of(side: Side) -> Array:
+    """Radius about the centre of mass that holds the core: what lies about it at one distance does not feel a spin."""
+    return reach_of(side) - lax.stop_gradient(radius(side.shape))
 
 
 def reach_of(side: Side) -> Array:
