@@ -19,8 +19,10 @@ from jax import Array
 from diffrigid.compiling import QUICK
 from diffrigid.sysid.problem import Group, linearise
 
+FAINT = 1e-2  # [-] of the largest slope: what has a smaller one is damped as if it had that
+DAMPING = (1e-9, 1e9)  # with FAINT the first holds what is seen less than 3e-7 of that: rounding, or what joints yield to
 STIFF = 1e7  # a damping above which a start counts as converged
-SMALL = 1e-9  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
+SMALL = 1e-5  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
 ITERATIONS = 60  # at most, unless another number is asked for
 INTERRUPTED = "interrupted: the best so far"
 UNFINISHED = "not converged after {} iterations: raise iterations, or start elsewhere"
@@ -138,7 +140,8 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
     B = eq.B * free[None, None, :, None]
 
     def enlarged(block: Array, damping: Array) -> Array:
-        scale = jnp.maximum(jnp.diagonal(block, axis1=-2, axis2=-1), 1e-12)
+        scale = jnp.diagonal(block, axis1=-2, axis2=-1)
+        scale = jnp.maximum(scale, FAINT**2 * scale.max(-1, keepdims=True) + 1e-12) if scale.size else scale
         unit = jnp.eye(block.shape[-1], dtype=block.dtype).reshape((1,) * (block.ndim - 2) + block.shape[-2:])
         return block + (damping * scale)[..., None] * unit
 
@@ -161,7 +164,7 @@ def update(
     better = jnp.where(alone, new_cost < progress.cost, whole[None])
     point = _chosen(better, whole, trial, progress.point, members)
     cost = jnp.where(better, new_cost, progress.cost)
-    damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), 1e-9, 1e9)
+    damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), *DAMPING)
     eq = damped(arrow(loss, point, members), damping.T, held)
     shared, own = solve(eq)
     gain = -0.5 * (eq.h * own).sum(-1).T
