@@ -6,6 +6,7 @@ FORCE.field                              a force of the scene, by its name: "dra
 JOINT.field                              a joint of the scene, by its name: "revolute.anchor_a"
 JOINT.angle | rate, JOINT.translation | rate    initial state of a hinge, of a slider, with all that hangs on it
 BODY.mass | inertia | restitution | friction | ... | shape.FIELD
+BODY.density                             of a body that is solid: sets its mass, and its inertia by its shape
 BODY.x | v | q | w | angle               initial state (angle: 2D)
 STATIC.x | q | angle | restitution | friction | ... | shape.FIELD
 PATH[k]                                  number k of a vector: "ball.v[0]"
@@ -28,7 +29,7 @@ from diffrigid.convert import Numbers, known, nearest, numbers
 from diffrigid.forces import Gravity
 from diffrigid.joints import Revolute
 from diffrigid.pytree import array_fields, letters_of, replace
-from diffrigid.shapes import traced
+from diffrigid.shapes import BOUNDLESS, traced, volume_properties
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
 
@@ -53,9 +54,8 @@ class Place(NamedTuple):
     chain: tuple[str | int, ...]
     row: int | None  # None: all of it
     angle: bool = False  # the leaf is q, the value an angle
-    joint: tuple[str, str] | None = (
-        None  # its name and "angle", "translation" or "rate", of which leaf and row are part
-    )
+    joint: tuple[str, str] | None = None  # name and "angle", "translation" or "rate": the leaf is part of what moves
+    shape: tuple[int, int] | None = None  # group and row of a shape: the value is its density
 
 
 def read(world: World, state: State, path: str) -> Array:
@@ -73,6 +73,8 @@ def read(world: World, state: State, path: str) -> Array:
     place = places(world, path)[0]
     if place.joint:
         return joint_motion.read(world, state, *place.joint)
+    if place.shape and place.row is not None:
+        return _row(world.bodies.mass, place.row) / _solid(world, place.shape)[0]
     leaf: Any = (world, state)
     for key in place.chain:
         leaf = leaf[key] if isinstance(key, int) else getattr(leaf, key)
@@ -101,9 +103,16 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
         vector = read(world, state, whole)
         part = numbers(path, value, _item(vector, whole, index).shape, finite=False)
         return write(world, state, whole, _with_rows(vector, index, part.astype(vector.dtype)))
-    if joint := places(world, path)[0].joint:
+    if (place := places(world, path)[0]).joint or place.shape:
         number = jnp.asarray(numbers(path, value, (), finite=False), state.x.dtype)
-        return world, joint_motion.write(world, state, *joint, number)
+        if place.joint:
+            return world, joint_motion.write(world, state, *place.joint, number)
+        volume, gyration = _solid(world, place.shape)
+        mass, inertia = (
+            getattr(world.bodies, leaf).at[place.row].set(new)
+            for leaf, new in (("mass", number * volume), ("inertia", number * volume * gyration))
+        )
+        return replace(world, bodies=replace(world.bodies, mass=mass, inertia=inertia)), state
     pair: Any = (world, state)
     for place in places(world, path):
         pair = _update(pair, place.chain, lambda record, field, place=place: _set(record, field, place, path, value))
@@ -114,6 +123,8 @@ def unit(world: World, path: str) -> str:
     """SI unit of a parameter; "" where it has none or is unknown."""
     owner, _, field = component(path)[0].rpartition(".")
     kinds = [joint for names, joint in zip(world.joint_names, world.joints, strict=True) if owner in names]
+    if field == "density":
+        return f"kg/m^{world.dim}"
     along = {} if not kinds else ABOUT_AXIS if isinstance(kinds[0], Revolute) else ALONG_AXIS
     return along.get(field, UNITS.get(field, ""))
 
@@ -131,10 +142,18 @@ def places(world: World, path: str) -> list[Place]:
 
 
 def order_of(world: World, path: str) -> int:
-    """1 for the angle or translation of a joint, 2 for its rate, 0 for anything else; they are set in this order."""
+    """When to set a parameter beside others: shapes before densities, all before joints, and their rates last."""
     known = catalogue(world).get(component(path)[0], [])
-    joint = known[0].joint if known else None
-    return 0 if joint is None else 1 + (joint[1] == joint_motion.RATE)
+    place = known[0] if known else Place((), None)
+    return (2 + (place.joint[1] == joint_motion.RATE)) if place.joint else int(place.shape is not None)
+
+
+def _solid(world: World, shape: tuple[int, int] | None) -> tuple[Array, Array]:
+    """Volume [m^D] and inertia over mass [m^2] of a shape, by its group and row."""
+    assert shape is not None
+    one = jax.tree.map(lambda leaf: leaf[shape[1]], world.shapes[shape[0]])
+    volume, _, gyration = volume_properties(one, world.dim)
+    return volume, gyration
 
 
 def hint(world: World, path: str, known: Iterable[str]) -> str:
@@ -204,6 +223,9 @@ def catalogue(world: World) -> dict[str, list[Place]]:
     names = world.names + world.static_names
     for group, (shape, owners) in enumerate(zip(world.shapes, world.owners, strict=True)):
         for row, owner in enumerate(owners):
+            if owner < len(world.names) and not isinstance(shape, BOUNDLESS):
+                of_density = [(0, "bodies", leaf) for leaf in ("mass", "inertia")]
+                out[f"{names[owner]}.density"] = [Place(leaf, owner, shape=(group, row)) for leaf in of_density]
             for field in array_fields(shape):
                 out[f"{names[owner]}.shape.{field}"] = [Place((0, "shapes", group, field), row)]
     return out

@@ -50,6 +50,7 @@ def test_every_leaf_has_a_path():
     expected |= {"cue.shape.radius", "ball.shape.radius", "block.shape.vertices", "wall.shape.half"}
     expected |= {"floor.shape.normal", "floor.shape.offset", "restitution", "friction", "gravity", "gravity.g"}
     expected |= {"air.linear", "air.angular", "push.F", "motor.tau", "contact.width", "contact.rest_speed"}
+    expected |= {f"{name}.density" for name in ("cue", "ball", "block")}
     expected |= {f"rope.{field}" for field in ("anchor_a", "anchor_b", "stiffness", "damping", "length")}
     assert set(paths.catalogue(FLAT[0])) == expected
     assert {"restitution_falloff", "ground.restitution_falloff"} < set(paths.catalogue(SOLID[0]))
@@ -75,9 +76,10 @@ def test_round_trip(scene, path):
     changed = paths.write(world, state, path, new)
     assert_allclose(paths.read(*changed, path), new, rtol=1e-15)
     moved = changed_rows(scene, changed)
-    assert len(moved) == (2 if path in COEFFICIENTS else 1)  # those are of bodies and statics
+    several = path in COEFFICIENTS or path.endswith(".density")  # of bodies and statics; mass and inertia
+    assert len(moved) == (2 if several else 1)
     if path.split(".")[0] in world.names + world.static_names:
-        assert [len(rows) for rows in moved.values()] == [1]  # no other body
+        assert {len(rows) for rows in moved.values()} == {1}  # no other body
 
 
 @pytest.mark.parametrize("scene", (FLAT, SOLID), ids=("2D", "3D"))
@@ -176,3 +178,23 @@ def test_a_path_of_what_was_left_out_says_so():
     ):
         with pytest.raises(ValueError, match=f"left out when the scene was made: give {field}"):
             paths.read(*scene, path)
+
+
+def test_a_density_sets_mass_and_inertia_by_the_shape():
+    box = dr.Body(dr.Box(half=(0.2, 0.3)), density=5.0, x=(0.0, 0.0))
+    corners = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    for body, size in ((box, "shape.half"), (dr.Body(dr.Hull(vertices=corners), density=5.0, x=(0.0,) * 3), None)):
+        floor = dr.Static(dr.HalfSpace(normal=np.eye(len(body.x))[-1], offset=-2.0))
+        world, state = dr.scene({"floor": floor, "body": body})
+        assert_allclose(dr.paths.read(world, state, "body.density"), 5.0, rtol=1e-12)
+        assert dr.paths.unit(world, "body.density") == f"kg/m^{world.dim}"
+        denser, _ = dr.paths.write(world, state, "body.density", 15.0)
+        for leaf in ("mass", "inertia"):
+            assert_allclose(getattr(denser.bodies, leaf), 3.0 * getattr(world.bodies, leaf), rtol=1e-12)
+        if size:
+            larger, _ = dr.paths.write(*dr.paths.write(world, state, f"body.{size}", (0.4, 0.6)), "body.density", 5.0)
+            assert_allclose(larger.bodies.inertia, 16.0 * world.bodies.inertia, rtol=1e-12)  # of an area, m r^2
+        assert "floor.density" not in dr.paths.catalogue(world)
+    with pytest.raises(ValueError, match="set the same number"):
+        free = {"body.density": dr.positive(), "body.inertia": dr.inertia()}
+        dr.sysid.make_problem(world, state, {"t": np.arange(3.0), "body.x": np.zeros((3, 3))}, free=free)
