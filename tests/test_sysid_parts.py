@@ -17,12 +17,17 @@ from diffrigid.__main__ import main
 from diffrigid.impacts import order_of_impacts
 from diffrigid.scene_file import read_scene
 from diffrigid.step import steps_in
-from diffrigid.sysid.diagnosis import doubts, normality, whiteness
+from diffrigid.sysid.diagnosis import Blind, doubts, normality, whiteness
+from diffrigid.sysid.levenberg import Numbers, Point, minimise
+from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import in_words
+from diffrigid.sysid.parameters import Slot
 from diffrigid.sysid.records import columns, read_csv
+from diffrigid.sysid.result import interval_of, unseen_of
 from diffrigid.sysid.sampling import Posterior
 from diffrigid.sysid.sensors import channel_of, difference, predict
 from diffrigid.sysid.summary import Parameter, Summary
+from diffrigid.sysid.table import BLIND, rows_of
 
 WORLD, STATE = dr.scene(
     {
@@ -485,3 +490,56 @@ def test_fit_from_the_command_line(tmp_path):
     with pytest.raises(SystemExit), contextlib.redirect_stderr(said):
         main(["fit", files[0], str(tmp_path / "other.csv")])
     assert "has no column 'time', which is 't' here: did you mean 'times'?" in said.getvalue()
+
+
+# ---- numbers that are hardly seen, or not
+
+
+def test_a_number_that_is_seen_by_rounding_only_does_not_hold_up_the_others():
+    """Its slope is 1e-8 of the largest, so that the step in which it helps is 1e8 long; one of 0.5 costs more."""
+
+    def residuals(z):
+        return 1e3 * jnp.stack([z[0] - 1.0 + 1e-8 * z[1], jnp.maximum(jnp.abs(z[1]) - 0.5, 0.0)])
+
+    def at(z):
+        line = z.shared[:, 0]
+        r, jacobian = residuals(line), jax.jacfwd(residuals)(line)
+        return Point(z, (r[:, None, None],), (jacobian[:, :, None, None],))
+
+    start = Numbers(jnp.array([[0.0], [0.1]]), jnp.zeros((0, 1, 1)))
+    reach = Numbers(jnp.full((2, 1), jnp.inf), jnp.zeros((0, 1, 1)))
+    counts = []
+    point, why = minimise(at, ((0,),), start, Squares(), None, reach, lambda count, costs: counts.append(count))
+    assert why == ""
+    assert_allclose(point.z.shared[0, 0], 1.0, atol=1e-6)
+    assert len(counts) < 30
+
+
+def test_what_is_seen_of_an_inertia_has_an_interval():
+    """Of three second moments the second is not seen: of the inertia, that about the second axis is without it."""
+    slot, about = (
+        Slot("die.inertia", ("die.inertia",), dr.inertia(principal=True), 3),
+        jnp.diag(jnp.array([3.0, 4.0, 5.0])),
+    )
+    unseen = unseen_of([Blind(np.array([0.0, 1.0, 0.0]), ("die.inertia",), "")], slice(0, 3))
+    value, low, high = interval_of(slot, np.zeros(3), 1e-4 * np.eye(3), about, 2.0, unseen)
+    assert_allclose(value, about, atol=1e-12)
+    wide = high - low
+    assert np.isinf(wide[[0, 2], [0, 2]]).all()
+    sizes = np.array([3.0, 1.0])  # second moments along axes 1 and 3: their sum is the inertia about axis 2
+    assert_allclose(wide[1, 1], 2 * 2.0 * 1e-2 * np.sqrt((sizes**2).sum()), rtol=1e-6)
+    assert_allclose(wide[0, 1], 0.0, atol=1e-12)
+
+
+def test_only_numbers_without_an_interval_are_said_not_to_be_determined():
+    p = Parameter("ball.x", np.array([1.0, 2.0]), np.array([0.9, -np.inf]), np.array([1.1, np.inf]), "m", BLIND)
+    assert [row[-1] for row in rows_of(p)] == ["", BLIND]
+
+
+def test_degrees_in_a_column_of_angles_are_noticed():
+    wheel = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 0.0), w=1.0)
+    t = np.arange(60) / 30
+    found = dr.fit(
+        *dr.scene({"wheel": wheel}), {"t": t, "wheel.angle": np.degrees(2.0 * t)}, free={"wheel.w": dr.real()}
+    )
+    assert found.notes[0].startswith("this is no fit") and "degrees" in found.notes[0]

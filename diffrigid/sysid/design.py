@@ -179,5 +179,7 @@ def _parameters(problem: Problem, record: int, linear: Linear) -> tuple[Paramete
 
 def _parameter(slot: Slot, z: np.ndarray, covariance: np.ndarray, problem: Problem, record: int) -> Parameter:
     about = reference(slot, scene_of(problem.runs[record]))
-    value, low, high = interval_of(slot, z, covariance, about, 1.959964)
+    known = np.isfinite(np.diag(covariance))
+    unseen = np.eye(len(known))[~known]
+    value, low, high = interval_of(slot, z, np.where(known, covariance, 0.0), about, 1.959964, unseen)
     return Parameter(slot.name, value, low, high, unit_of(problem, slot), "expected")

@@ -17,6 +17,9 @@ RARE = 1e-3  # chance below which residuals are not taken for noise
 LAGS = 5  # frames over which residuals are compared with themselves
 
 
+ANY = 100.0  # of a logarithm: more is not told apart
+
+
 @dataclass(frozen=True)
 class Coordinate:
     """One number of z: the parameter that it belongs to."""
@@ -138,7 +141,7 @@ def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate]) -> list[str]
     """Shared parameters of which the data say next to nothing, though something."""
     deviation = np.sqrt(np.diag(covariance))
     hidden = [(c, s) for c, s in zip(coordinates, deviation, strict=True) if LARGE * c.scale < s < np.inf]
-    known = [f"a factor {np.exp(s):.2g}" if c.logarithmic else f"+- {s:.2g}" for c, s in hidden]
+    known = [f"a factor {np.exp(min(s, ANY)):.2g}" if c.logarithmic else f"+- {s:.2g}" for c, s in hidden]
     return [f"{c.name} is hardly seen: known to {text}" for (c, _), text in zip(hidden, known, strict=True)]
 
 

@@ -264,7 +264,8 @@ def _refuse_blind(problem: Problem, linear: Linear) -> None:
         if not np.any(size > 0):
             raise ValueError(
                 f"free: nothing that was measured depends on {slot.name} at the best fit: "
-                "leave it out, or give a record that shows it: an impact for restitution, one that slips for friction"
+                "leave it out, or give a record that shows it: an impact for restitution, one that slips for friction. "
+                "If there is one, begin closer: with less friction, so that it slips in the simulation too"
             )
 
 

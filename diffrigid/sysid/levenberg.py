@@ -20,9 +20,10 @@ from diffrigid.compiling import QUICK
 from diffrigid.sysid.problem import Group, linearise
 
 FAINT = 1e-2  # [-] of the largest slope: what has a smaller one is damped as if it had that
-DAMPING = (1e-9, 1e9)  # with FAINT the first holds what is seen less than 3e-7 of that: rounding, or what joints yield to
+DAMPING = (1e-9, 1e9)  # with FAINT the first holds what is seen less than 3e-7 of that: rounding, or yielding joints
 STIFF = 1e7  # a damping above which a start counts as converged
-SMALL = 1e-5  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
+SMALL = 1e-9  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
+SETTLED = 1e-8  # decrease of the cost, relative to it, below which an accepted step was the last
 ITERATIONS = 60  # at most, unless another number is asked for
 INTERRUPTED = "interrupted: the best so far"
 UNFINISHED = "not converged after {} iterations: raise iterations, or start elsewhere"
@@ -164,13 +165,16 @@ def update(
     better = jnp.where(alone, new_cost < progress.cost, whole[None])
     point = _chosen(better, whole, trial, progress.point, members)
     cost = jnp.where(better, new_cost, progress.cost)
+    before, after = (jnp.where(alone, c, c.sum(0)[None]) for c in (progress.cost, cost))
+    settled = better & (before - after <= SETTLED * after)
     damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), *DAMPING)
     eq = damped(arrow(loss, point, members), damping.T, held)
     shared, own = solve(eq)
     gain = -0.5 * (eq.h * own).sum(-1).T
     gain = jnp.where(alone, gain, (gain.sum(0) - 0.5 * (eq.g * shared).sum(-1))[None])
-    level = jnp.where(alone, cost, cost.sum(0)[None]) / sum(len(r) for r in point.residuals)
-    done = (gain < SMALL * level) | (damping > STIFF) | ~jnp.isfinite(level)
+    level = after / sum(len(r) for r in point.residuals)
+    settled = settled & (gain <= 100.0 * SETTLED * after)
+    done = (gain < SMALL * level) | settled | (damping > STIFF) | ~jnp.isfinite(level)
     step = Numbers(shared.T, jnp.transpose(own, (2, 1, 0)))
     step = jax.tree.map(lambda dz, most: jnp.clip(jnp.where(jnp.isfinite(dz), dz, 0.0), -most, most), step, reach)
     return Progress(point, cost, damping, done), jax.tree.map(jnp.add, point.z, step)

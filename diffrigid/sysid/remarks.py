@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffrigid.constraints import joint_errors, placed
-from diffrigid.joint_motion import fields_of
+from diffrigid.joint_motion import fields_of, moving_side
 from diffrigid.state import rotations
 from diffrigid.sysid.diagnosis import RARE, whiteness
 from diffrigid.sysid.parameters import Scene
@@ -14,6 +14,7 @@ from diffrigid.sysid.records import Run
 from diffrigid.sysid.setup import Problem
 
 AS_LARGE = 0.5  # [-] of the spread of a column: residuals from which on, if they follow each other, nothing is fitted
+ANYWHERE = 0.25  # [-] of a turn: angles that are anywhere have residuals of 1 / sqrt(12) of one
 TORN = 1e-3  # [m or rad] by which a joint may be off at the fitted start
 
 
@@ -34,7 +35,7 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
     if names:
         out.append(
             f"this is no fit: residuals of {', '.join(dict.fromkeys(names))} are as large as the motion; look at units "
-            "(m, s, rad) and at the values to begin with, or try more starts"
+            "(m, s, rad; degrees need scale=180 / pi) and at the values to begin with, or try more starts"
         )
     out += _torn(scenes[0])
     if np.isfinite(problem.window):
@@ -48,6 +49,8 @@ def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray) -> 
     if turn := full_turn(run, name):
         values = np.unwrap(values[np.isfinite(values).all(1)], axis=0, period=turn)
     spread, size = (np.sqrt(part.sum()) for part in (np.nanvar(values, axis=0), np.nanmean(residuals**2, axis=0)))
+    if turn and bool(size > ANYWHERE * turn):
+        return True
     turned = residuals.shape[1] != values.shape[1]  # by twice the change of a unit quaternion
     return bool(size > AS_LARGE * spread * (1.0 + turned)) and whiteness(list(residuals.T)) < RARE
 
@@ -59,7 +62,7 @@ def _torn(scene: Scene) -> list[str]:
         return []
     errors = np.asarray(joint_errors(rotations(world.dim), placed(world.joints, world.statics, state.x, state.q)))
     joints = [
-        (name, "".join(f"{name}.{field}" for field in fields_of(joint)[:1]))
+        (name, "".join(f"{name}.{field}" for field in fields_of(joint)[:1] if moving_side(world, name)[1]))
         for names, joint in zip(world.joint_names, world.joints, strict=True)
         for name in names
     ]

@@ -13,7 +13,15 @@ import numpy as np
 from diffrigid.paths import unit
 from diffrigid.state import State
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
-from diffrigid.sysid.diagnosis import blind_directions, coordinates, correlations, doubts, infinite_where_blind, weak
+from diffrigid.sysid.diagnosis import (
+    Blind,
+    blind_directions,
+    coordinates,
+    correlations,
+    doubts,
+    infinite_where_blind,
+    weak,
+)
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.losses import Squares
@@ -31,12 +39,13 @@ from diffrigid.sysid.setup import (
     with_noise,
 )
 from diffrigid.sysid.summary import Parameter, Summary
-from diffrigid.sysid.table import html_table, text_table
+from diffrigid.sysid.table import BLIND, html_table, text_table
 from diffrigid.sysid.times import all_times, motion
 from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
 
 SCORED = 30  # iterations for the numbers of a record that was held out
+UNSEEN = 1e-6  # [-] of a slope along what is not seen: more is not rounding
 CLOSE = 0.95  # [-] a correlation from which two parameters are reported to move together
 
 
@@ -209,13 +218,12 @@ def describe(
     quantile = student_quantile(uncertainty.freedom)
     covariance = infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared))
     parameters = [
-        _shared_parameter(problem, slot, z, block, quantile, blind)
-        for slot, z, block in _pieces(problem.shared, shared, covariance)
+        _shared_parameter(problem, slot, shared[rows], uncertainty.covariance[rows, rows], quantile, blind, rows)
+        for slot, rows in _pieces(problem.shared)
     ]
     if problem.own:
         blocks = [own_covariance(linear, k, uncertainty.covariance) for k in range(len(problem.runs))]
-        blocks = [infinite_where_blind(block, blind, slice(linear.shared, None)) for block in blocks]
-        parameters += _own_parameters(problem, own, blocks, quantile, blind)
+        parameters += _own_parameters(problem, own, blocks, quantile, blind, linear.shared)
     notes = [b.words for b in blind]
     if uncertainty.freedom < linear.shared:
         notes.append(f"{uncertainty.freedom:.0f} degrees of freedom for {linear.shared} intervals: fit more records")
@@ -235,52 +243,70 @@ def references(problem: Problem) -> list[np.ndarray]:
     return [np.asarray(reference(slot, scene_having(problem, slot))) for slot in (*problem.shared, *problem.own)]
 
 
-def _pieces(slots: tuple[Slot, ...], z: np.ndarray, covariance: np.ndarray):
-    first = 0
-    for slot in slots:
-        rows = slice(first, first + slot.size)
-        yield slot, z[rows], covariance[rows, rows]
-        first += slot.size
+def _pieces(slots: tuple[Slot, ...], first: int = 0) -> list[tuple[Slot, slice]]:
+    """The numbers of z of each parameter, from `first` on."""
+    ends = np.cumsum([first, *(slot.size for slot in slots)])
+    return [(slot, slice(*pair)) for slot, *pair in zip(slots, ends[:-1], ends[1:], strict=True)]
 
 
-def _shared_parameter(problem: Problem, slot: Slot, z, covariance, quantile: float, blind) -> Parameter:
+def _shared_parameter(
+    problem: Problem, slot: Slot, z: np.ndarray, covariance: np.ndarray, quantile: float, blind: Sequence[Blind],
+    rows: slice,
+) -> Parameter:  # fmt: skip
     about = reference(slot, scene_having(problem, slot))
-    value, low, high = interval_of(slot, z, covariance, about, quantile)
-    note = "at its bound" if slot.kind.at_bound(value) else ""
-    if any(slot.name in b.names for b in blind):
-        note = "not determined, see below"
-    return Parameter(slot.name, value, low, high, unit_of(problem, slot), note)
+    value, low, high = interval_of(slot, z, covariance, about, quantile, unseen_of(blind, rows))
+    return Parameter(slot.name, value, low, high, unit_of(problem, slot), _note(slot, value, blind))
 
 
-def _own_parameters(problem: Problem, own: np.ndarray, blocks: list[np.ndarray], quantile: float, blind):
-    records, first = len(problem.runs), 0
-    for slot in problem.own:
-        rows = slice(first, first + slot.size)
+def _own_parameters(
+    problem: Problem, own: np.ndarray, blocks: list[np.ndarray], quantile: float, blind: Sequence[Blind], shared: int
+):
+    for (slot, rows), (_, of_z) in zip(_pieces(problem.own), _pieces(problem.own, shared), strict=True):
+        unseen = unseen_of(blind, of_z)
         triples = [
-            interval_of(slot, own[rows, k], blocks[k][rows, rows], reference(slot, scene_of(run)), quantile)
+            interval_of(slot, own[rows, k], blocks[k][rows, rows], reference(slot, scene_of(run)), quantile, unseen)
             for k, run in enumerate(problem.runs)
         ]
         value, low, high = (np.stack(parts) for parts in zip(*triples, strict=True))
-        note = "at its bound" if slot.kind.at_bound(value) else ""
-        if any(slot.name in b.names for b in blind):
-            note = "not determined, see below"
-        yield Parameter(slot.name, value, low, high, unit_of(problem, slot), note, records)
-        first += slot.size
+        note = _note(slot, value, blind)
+        yield Parameter(slot.name, value, low, high, unit_of(problem, slot), note, len(problem.runs))
 
 
-def interval_of(slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, quantile: float):
-    """Value, low and high end: through the map of z where it acts number by number, else to first order."""
-    deviation = np.sqrt(np.diag(covariance))
+def _note(slot: Slot, value: np.ndarray, blind: Sequence[Blind]) -> str:
+    if any(slot.name in b.names for b in blind):
+        return BLIND
+    return "at its bound" if slot.kind.at_bound(value) else ""
+
+
+def unseen_of(blind: Sequence[Blind], rows: slice) -> np.ndarray:
+    """What the directions that are not seen change of some numbers of z, orthonormal, (n, k)."""
+    parts = np.stack([np.zeros(rows.stop - rows.start), *(b.direction[rows] for b in blind)])
+    parts = parts / np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), 1e-300)
+    _, sizes, basis = np.linalg.svd(parts, full_matrices=False)
+    return basis[sizes > UNSEEN]
+
+
+def interval_of(
+    slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, quantile: float, unseen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Value, low and high end: through the map of z where it acts number by number, else to first order.
+
+    Infinite where a value changes along `unseen` (n, k): what remains of it without these has an interval.
+    """
     if isinstance(slot.kind, Free):
+        deviation = np.where(np.abs(unseen).max(0, initial=0.0) > UNSEEN, np.inf, np.sqrt(np.diag(covariance)))
         ends = (z, z - quantile * deviation, z + quantile * deviation)
-        return tuple(np.asarray(slot.kind.value(end, about), float) for end in ends)
+        with np.errstate(over="ignore"):  # of what is hardly seen
+            value, low, high = (np.asarray(slot.kind.value(end, about), float) for end in ends)
+        return value, low, high
     centre = jnp.asarray(z, jnp.result_type(about))
     value = np.asarray(slot.kind.value(centre, about), float)
     slope = np.asarray(jax.jacfwd(slot.kind.value)(centre, about), float)
-    if not np.isfinite(covariance).all():
-        half = np.full(value.shape, np.inf)
-    else:
-        half = quantile * np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", slope, covariance, slope), 0.0))
+    along = slope @ unseen.T
+    blind = np.linalg.norm(along, axis=-1) > UNSEEN * np.linalg.norm(slope, axis=-1)
+    slope = slope - along @ unseen
+    half = quantile * np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", slope, covariance, slope), 0.0))
+    half = np.where(blind, np.inf, half)
     return value, value - half, value + half
 
 

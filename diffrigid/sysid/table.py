@@ -10,6 +10,7 @@ from diffrigid.sysid.orders import in_words
 from diffrigid.tables import as_html, digits, lined_up
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
+BLIND = "not determined, see below"  # of a parameter of which some number has no interval
 SHOWN = 3  # records whose own numbers are in the table
 
 
@@ -29,7 +30,8 @@ def rows_of(p: Any) -> list[tuple[str, ...]]:
         value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
         places = digits(value, low, high, 3)
         interval = f"{low:.{places}g} .. {high:.{places}g}"
-        out.append((name, f"{value:.{places}g}", interval, p.unit or "-", p.note))
+        note = "" if p.note == BLIND and np.isfinite(low) and np.isfinite(high) else p.note
+        out.append((name, f"{value:.{places}g}", interval, p.unit or "-", note))
     if p.records > SHOWN:
         out.append((p.name, "...", "", "", f"and {p.records - SHOWN} more records"))
     return out
