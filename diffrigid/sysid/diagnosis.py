@@ -15,9 +15,7 @@ SMALL = 0.05  # [-] parts of a direction below this of its largest are rounding,
 LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that says nothing of it
 RARE = 1e-3  # chance below which residuals are not taken for noise
 LAGS = 5  # frames over which residuals are compared with themselves
-
-
-ANY = 100.0  # of a logarithm: more is not told apart
+ANY = 20.0  # standard deviations of a logarithm: of factors from there on nobody needs to know how large
 
 
 @dataclass(frozen=True)
@@ -141,8 +139,14 @@ def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate]) -> list[str]
     """Shared parameters of which the data say next to nothing, though something."""
     deviation = np.sqrt(np.diag(covariance))
     hidden = [(c, s) for c, s in zip(coordinates, deviation, strict=True) if LARGE * c.scale < s < np.inf]
-    known = [f"a factor {np.exp(min(s, ANY)):.2g}" if c.logarithmic else f"+- {s:.2g}" for c, s in hidden]
-    return [f"{c.name} is hardly seen: known to {text}" for (c, _), text in zip(hidden, known, strict=True)]
+
+    def text(c: Coordinate, s: float) -> str:
+        if not c.logarithmic:
+            return f"+- {s:.2g}"
+        return f"a factor {np.exp(s):.2g}" if s < ANY else "any factor"
+
+    known = [text(c, s) for c, s in hidden]
+    return [f"{c.name} is hardly seen: known to {words}" for (c, _), words in zip(hidden, known, strict=True)]
 
 
 def correlations(covariance: np.ndarray) -> np.ndarray:
