@@ -133,7 +133,8 @@ def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Poli
     dt = closing
     if gaps.normal is not None:  # which turns: that the gap opens again is only known after a look at where it would
         opens = (v < 0) & (height > 0) & (v * v < 2.0 * acc * height) & ~rests
-        dt = jnp.minimum(dt, _least(jnp.where(opens, safe_divide(-v, acc), jnp.inf)))
+        turns = jnp.where(opens, safe_divide(-v, acc), 0.0)
+        dt = jnp.minimum(dt, _least(jnp.where(turns > (slack * task.span)[None], turns, jnp.inf)))
     # What is later is no impact; that a step leads a little beyond the end does not tell yet.
     within = (dt < 0) | ((s < task.t1 + slack * task.span) & (s + dt < task.t1 + task.span))
     at_level = (gap <= level + (slack * task.size)[None]) & ((v < 0) | (acc < 0)) & ~rests
