@@ -154,6 +154,9 @@ def test_observers_read_what_geometry_says():
     assert_allclose(reading(lambda state: state.x[1] - state.x[0]), (3.0, 4.0))
     assert_allclose(reading(lambda state: state.v[0, 0]), (3.0,))
     assert_allclose(reading(dr.Channel("cue.x", bias=(0.1, 0.0), scale=2.0)), (2.1, 4.0))
+    assert_allclose(reading("cue.x[1]"), (2.0,))
+    with pytest.raises(ValueError, match=r"cue.x has 2 numbers"):
+        reading("cue.x[2]")
 
 
 def test_cameras():
@@ -543,3 +546,13 @@ def test_degrees_in_a_column_of_angles_are_noticed():
         *dr.scene({"wheel": wheel}), {"t": t, "wheel.angle": np.degrees(2.0 * t)}, free={"wheel.w": dr.real()}
     )
     assert found.notes[0].startswith("this is no fit") and "degrees" in found.notes[0]
+
+
+def test_times_in_milliseconds_are_doubted_before_the_fit():
+    bodies = {
+        "ball": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0)),
+        "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+    }
+    t, free = np.linspace(0.0, 2000.0, 61), {"ball.v": dr.real()}
+    with pytest.warns(UserWarning, match="a record of 2e.03 s takes 1e.05 steps of 0.02 s: are its times seconds?"):
+        sysid.make_problem(*dr.scene(bodies), {"t": t, "ball.x": np.zeros((61, 2))}, free=free)

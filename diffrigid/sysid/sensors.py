@@ -21,6 +21,7 @@ from jax import Array
 from diffrigid import joint_motion, so3
 from diffrigid.convert import nearest, numbers, unit_quaternion
 from diffrigid.numerics import norm
+from diffrigid.paths import component
 from diffrigid.pytree import Leaf, array, array_fields, map_arrays, pytree, replace, static
 from diffrigid.state import State, material_point, rotations
 from diffrigid.world import World, axis_sizes
@@ -55,6 +56,17 @@ class JointPart:
 
     def __call__(self, state: State, world: World) -> Array:
         return joint_motion.read(world, state, self.joint, self.field)[None]
+
+
+@pytree
+class Component:
+    """One number of another observer: "ball.x[0]"."""
+
+    of: Any = _first()
+    index: int = static()
+
+    def __call__(self, state: State) -> Array:
+        return self.of(state)[self.index : self.index + 1]
 
 
 @pytree
@@ -232,6 +244,12 @@ def size_of(observer: Any, world: World) -> int:
 def _resolved(name: str, what: Any, world: World) -> Any:
     """An observer with indices for the names of bodies."""
     if isinstance(what, str):
+        whole, index = component(what)
+        if index is not None and what != name:  # columns of that name are put together before
+            observer = _resolved(name, whole, world)
+            if index >= (size := size_of(observer, world)) or isinstance(observer, JointPart):
+                raise ValueError(f"observe[{name!r}] is {what!r}: {whole} has {size} numbers, from [0] on")
+            return Component(of=observer, index=index)
         body, _, field = what.rpartition(".") if "." in what else (what, "", "x")
         possible = [f"{b}.{f}" for b in world.names for f in FIELDS if f != "angle" or world.dim == 2]
         of_joints = {

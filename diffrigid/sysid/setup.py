@@ -5,6 +5,7 @@ residuals, jacobian = partial(residual_vector, problem), partial(jacobian_matrix
 scipy.optimize.least_squares(residuals, start_vector(problem), jacobian)
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ from diffrigid.sysid.records import Run, noise_guess, runs
 from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
 
+MANY = 50_000  # steps of a record, from which on its times are doubted
 LEAST = 1e-9  # noise that is taken for none
 
 
@@ -74,6 +76,12 @@ def make_problem(
         found = _resumed(found, resume, free, range(len(found)) if places is None else places)
     shared, own = make_slots(free, [scene_of(run) for run in found])
     longest = longest_step(found, dt)
+    lasts = max(float(series.t[-1]) - run.start for run in found for series in run.series)
+    if lasts > MANY * longest:
+        warnings.warn(
+            f"a record of {lasts:.3g} s takes {lasts / longest:.2g} steps of {longest:.3g} s: are its times seconds?",
+            stacklevel=3,
+        )
     groups = make_groups(found, (*shared, *own), len(shared), longest)
     problem = Problem(
         tuple(found), shared, own, tuple(groups), longest, _common_width(found), np.inf, {}, dict(free),

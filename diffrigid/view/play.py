@@ -76,8 +76,8 @@ def play(
 
     Args:
         trajectory: what `rollout` returns; or several by name, drawn over each other.
-        data: measured columns as `fit` takes them, "t" [s], "ball.x", "ball.angle" or "ball.q"; NaN is missing. For
-            several trajectories also such columns by their names.
+        data: measured columns as `fit` takes them, "t" [s], "ball.x", "ball.angle" or "ball.q"; NaN is missing. Of
+            joints nothing is drawn. For several trajectories also such columns by their names.
         beside: several trajectories side by side.
         speed: at which it starts; 1 is real time.
         show: what is shown at first, of "trails", "velocities", "contacts", "data".
