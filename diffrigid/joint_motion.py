@@ -14,7 +14,7 @@ from jax import Array
 
 from diffrigid.constraints import change, placed
 from diffrigid.joints import Pose, Prismatic, Revolute
-from diffrigid.linkage import ends_of, to_sides
+from diffrigid.linkage import ends_of, islands, to_sides
 from diffrigid.numerics import dot
 from diffrigid.pytree import replace
 from diffrigid.state import State, rotations
@@ -58,13 +58,14 @@ def moving_side(world: Any, name: str) -> tuple[int, tuple[int, ...]]:
 
 @functools.cache
 def _moving_side(ends: tuple[tuple[int, int], ...], index: int, moving: int) -> tuple[int, tuple[int, ...]]:
-    links = [tuple(min(end, moving) for end in pair) for k, pair in enumerate(ends) if k != index]  # one ground
-    sides = [_together(min(end, moving), links) for end in ends[index]]
-    if sides[0] == sides[1]:
+    grounded = [(min(a, moving), min(b, moving)) for a, b in ends]  # one body for all that stands still
+    a, b = grounded[index]
+    sides = islands(grounded[:index] + grounded[index + 1 :], moving + 1)
+    if b in sides[a]:
         return 0, ()
-    side = 1 if moving in sides[0] else 0
-    own = ends[index][side]
-    return side, (own, *sorted(sides[side] - {own}))
+    side = 1 if moving in sides[a] else 0
+    own = (a, b)[side]
+    return side, (own, *(body for body in sides[own] if body != own))
 
 
 class _At(NamedTuple):
@@ -82,15 +83,6 @@ def _at(world: Any, state: State, name: str) -> _At:
     twists = to_sides(ends_of(world.joints[group : group + 1]), jnp.concatenate([state.v, state.w], axis=1))
     joint, a, b = jax.tree.map(lambda leaf: leaf[row], tuple(at))
     return _At(joint, a, b, twists[row])
-
-
-def _together(first: int, links: list[tuple[int, ...]]) -> set[int]:
-    """What hangs together with the first."""
-    found, size = {first}, 0
-    while len(found) > size:
-        size = len(found)
-        found |= {end for link in links if found & set(link) for end in link}
-    return found
 
 
 class _Motion(NamedTuple):

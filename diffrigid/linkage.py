@@ -11,6 +11,7 @@ Source: Witkin, Physically Based Modeling: Constrained Dynamics, SIGGRAPH 1997 c
 """
 
 import functools
+from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
 
@@ -40,15 +41,14 @@ from diffrigid.state import Bodies, State, Wrench, rotations
 STRONGEST = 1.2  # [-] rate of damping times a step; several on one body add up, and with 2.8 the method is unstable
 
 
-def islands(joints: tuple, moving: int) -> tuple[tuple[int, ...], ...]:
-    """The bodies that hang together with each body by joints, itself included; moving bodies only."""
+def islands(ends: Iterable[tuple[int, int]], moving: int) -> tuple[tuple[int, ...], ...]:
+    """The bodies that hang together with each body by joints between such ends, itself included; moving bodies only."""
     together = [{body} for body in range(moving)]
-    for group in joints:
-        for a, b in zip(group.a, group.b, strict=True):
-            if a < moving and b < moving and together[a] is not together[b]:
-                together[a] |= together[b]
-                for body in together[b]:
-                    together[body] = together[a]
+    for a, b in ends:
+        if a < moving and b < moving and together[a] is not together[b]:
+            together[a] |= together[b]
+            for body in together[b]:
+                together[body] = together[a]
     return tuple(tuple(sorted(bodies)) for bodies in together)
 
 

@@ -73,8 +73,8 @@ def read(world: World, state: State, path: str) -> Array:
     place = places(world, path)[0]
     if place.joint:
         return joint_motion.read(world, state, *place.joint)
-    if place.shape and place.row is not None:
-        return _row(world.bodies.mass, place.row) / _solid(world, place.shape)[0]
+    if place.shape:
+        return world.bodies.mass[place.row] / _solid(world, *place.shape)[0]
     leaf: Any = (world, state)
     for key in place.chain:
         leaf = leaf[key] if isinstance(key, int) else getattr(leaf, key)
@@ -105,14 +105,13 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
         return write(world, state, whole, _with_rows(vector, index, part.astype(vector.dtype)))
     if (place := places(world, path)[0]).joint or place.shape:
         number = jnp.asarray(numbers(path, value, (), finite=False), state.x.dtype)
-        if place.joint:
-            return world, joint_motion.write(world, state, *place.joint, number)
-        volume, gyration = _solid(world, place.shape)
-        mass, inertia = (
-            getattr(world.bodies, leaf).at[place.row].set(new)
-            for leaf, new in (("mass", number * volume), ("inertia", number * volume * gyration))
-        )
-        return replace(world, bodies=replace(world.bodies, mass=mass, inertia=inertia)), state
+    if place.joint:
+        return world, joint_motion.write(world, state, *place.joint, number)
+    if place.shape:
+        volume, gyration = _solid(world, *place.shape)
+        bodies, mass = world.bodies, number * volume
+        mass, inertia = bodies.mass.at[place.row].set(mass), bodies.inertia.at[place.row].set(mass * gyration)
+        return replace(world, bodies=replace(bodies, mass=mass, inertia=inertia)), state
     pair: Any = (world, state)
     for place in places(world, path):
         pair = _update(pair, place.chain, lambda record, field, place=place: _set(record, field, place, path, value))
@@ -148,11 +147,9 @@ def order_of(world: World, path: str) -> int:
     return (2 + (place.joint[1] == joint_motion.RATE)) if place.joint else int(place.shape is not None)
 
 
-def _solid(world: World, shape: tuple[int, int] | None) -> tuple[Array, Array]:
-    """Volume [m^D] and inertia over mass [m^2] of a shape, by its group and row."""
-    assert shape is not None
-    one = jax.tree.map(lambda leaf: leaf[shape[1]], world.shapes[shape[0]])
-    volume, _, gyration = volume_properties(one, world.dim)
+def _solid(world: World, group: int, row: int) -> tuple[Array, Array]:
+    """Volume [m^D] and inertia over mass [m^2] of a shape."""
+    volume, _, gyration = volume_properties(jax.tree.map(lambda leaf: leaf[row], world.shapes[group]), world.dim)
     return volume, gyration
 
 

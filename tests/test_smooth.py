@@ -136,6 +136,28 @@ def test_annealing_compiles_once():
     assert np.abs(ends[0] - ends[-1]).max() > 1e-3
 
 
+def test_a_disc_that_just_misses_a_corner_is_turned_as_by_a_larger_one():
+    """Normal and time at the distance radius + level, level = width softplus(gap_min / width), and their slopes."""
+    r, width, speed, e = 0.1, 0.02, 2.0, 0.7
+
+    def simulated(miss):
+        x = jnp.stack([-0.3, r + miss])
+        disc = dr.Body(dr.Disc(radius=r), mass=1.0, x=x, v=(speed, 0.0))
+        corner = dr.Static(dr.Box(half=(0.5, 0.5)), x=(0.0, -np.sqrt(0.5)), angle=np.pi / 4)  # at the origin
+        world, state = dr.scene({"disc": disc, "corner": corner}, restitution=e, contact=dr.Contact(width=width))
+        return dr.rollout(world, state, dt=1 / 60, steps=15).state.v[-1, 0]
+
+    def expected(miss):
+        R = r + width * jnp.logaddexp(miss / width, 0.0)
+        n = jnp.stack([-jnp.sqrt(R**2 - (r + miss) ** 2), r + miss]) / R
+        return jnp.stack([speed, 0.0]) - (1.0 + e) * speed * n[0] * n
+
+    misses = jnp.array([-0.01, 0.005, 0.02])
+    for of in (lambda fn: fn, jax.jacfwd):
+        found, right = (jax.jit(jax.vmap(of(fn)))(misses) for fn in (simulated, expected))
+        assert_allclose(found, right, atol=EXACT)
+
+
 BOX = dict(shape=dr.Box(half=(0.2, 0.15)), y=0.36, angle=0.6)
 PATHS = {  # shape and spin of what comes along the x axis, and what it passes
     "disc and box": (dr.Disc(radius=0.1), 0.0, BOX),

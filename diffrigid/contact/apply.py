@@ -51,7 +51,8 @@ def apply_impulses(
     moving, active, held = flight.t0.shape[0], strikes.active.astype(kick.dtype), strikes.held.astype(kick.dtype)
     each = jnp.stack([active, active * strikes.s, held], axis=1)
     own = side_sum(each, each, strikes.a, strikes.b, moving)
-    count, total, evenly = jnp.moveaxis(over_islands(jnp.sum, own, islands(world.joints, moving), 0.0), 1, 0)
+    together = islands(ends_of(world.joints), moving)
+    count, total, evenly = jnp.moveaxis(over_islands(jnp.sum, own, together, 0.0), 1, 0)
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
     # Displacement per change of velocity [s]: a force that has acted evenly has its centroid in the middle.
     lever = jnp.where(kick > 0, jnp.where(evenly > 0, 0.5 * (t - flight.t0), 0.0), 1.0)

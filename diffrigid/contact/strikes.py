@@ -23,7 +23,7 @@ from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
 from diffrigid.gathers import constant, flags, rows
 from diffrigid.joints import Weld
-from diffrigid.linkage import islands
+from diffrigid.linkage import ends_of, islands
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace, HeightField, Profile
@@ -47,7 +47,7 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
     a, b = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
     bounces = _coefficients(world, "restitution", a, b, dt.shape) > 0 if waits(world) else None
     a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
-    links = Links(a, b, islands(world.joints, len(world.names)))
+    links = Links(a, b, islands(ends_of(world.joints), len(world.names)))
     meetings = in_order(meetings, links, flight.t0, dt, at_end, bounces)
     parts, jacs, start = [], {}, 0
     for pairs, sides, meeting in zip(world.pairs, groups, meetings, strict=False):
@@ -188,7 +188,7 @@ def ends(world: Any) -> dict[str, tuple[int, ...]]:
 def wholes(world: Any) -> tuple:
     """Of every contact and row, which two rigid wholes it is between: what is welded is one, and so are the statics."""
     moving, count, pairs = len(world.names), contact_count(world), ends(world)
-    whole = [min(body) for body in islands(tuple(g for g in world.joints if isinstance(g, Weld)), moving)]
+    whole = [min(body) for body in islands(ends_of(g for g in world.joints if isinstance(g, Weld)), moving)]
 
     def label(ends: tuple[int, int]) -> tuple:
         return tuple(sorted(whole[i] if i < moving else moving for i in ends))

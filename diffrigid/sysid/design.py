@@ -9,13 +9,13 @@ import numpy as np
 
 from diffrigid.state import State
 from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
-from diffrigid.sysid.diagnosis import blind_directions, coordinates, infinite_where_blind
+from diffrigid.sysid.diagnosis import Blind, blind_directions, coordinates, infinite_where_blind
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.parameters import Slot, make_slots, put, reference
+from diffrigid.sysid.parameters import make_slots, put, reference
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.records import Record
-from diffrigid.sysid.result import interval_of, references, unit_of
+from diffrigid.sysid.result import interval_of, pieces, references, unit_of, unseen_of
 from diffrigid.sysid.setup import Problem, first_numbers, make_problem, make_starts, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.world import World
@@ -151,12 +151,16 @@ def _linears(problem: Problem) -> list[Linear]:
     return [Linear((r,), (J,), (t,), linear.shared, 1.0, False) for r, J, t in rows]
 
 
+def _blind(problem: Problem, record: int, linear: Linear) -> list[Blind]:
+    """What a record does not see."""
+    slots, scene = (*problem.shared, *problem.own), scene_of(problem.runs[record])
+    return blind_directions(linear, coordinates(slots, [np.asarray(reference(slot, scene)) for slot in slots]))
+
+
 def _covariance(problem: Problem, record: int, linear: Linear) -> np.ndarray:
     """Of the shared numbers, infinite where a record does not see them."""
-    slots, scene = (*problem.shared, *problem.own), scene_of(problem.runs[record])
-    places = coordinates(slots, [np.asarray(reference(slot, scene)) for slot in slots])
-    shared = slice(0, linear.shared)
-    return infinite_where_blind(from_jacobian(linear).covariance, blind_directions(linear, places), shared)
+    blind, shared = _blind(problem, record, linear), slice(0, linear.shared)
+    return infinite_where_blind(from_jacobian(linear).covariance, blind, shared)
 
 
 def _score(covariance: np.ndarray) -> float:
@@ -168,18 +172,10 @@ def _score(covariance: np.ndarray) -> float:
 
 
 def _parameters(problem: Problem, record: int, linear: Linear) -> tuple[Parameter, ...]:
-    covariance, (z, _) = _covariance(problem, record, linear), first_numbers(problem)
-    out, first = [], 0
-    for slot in problem.shared:
-        rows = slice(first, first + slot.size)
-        out.append(_parameter(slot, z[rows], covariance[rows, rows], problem, record))
-        first += slot.size
+    covariance, (z, _) = from_jacobian(linear).covariance, first_numbers(problem)
+    blind, scene, out = _blind(problem, record, linear), scene_of(problem.runs[record]), []
+    for slot, rows in pieces(problem.shared):
+        about, unseen = reference(slot, scene), unseen_of(blind, rows)
+        ends = interval_of(slot, z[rows], covariance[rows, rows], about, 1.959964, unseen)
+        out.append(Parameter(slot.name, *ends, unit_of(problem, slot), "expected"))
     return tuple(out)
-
-
-def _parameter(slot: Slot, z: np.ndarray, covariance: np.ndarray, problem: Problem, record: int) -> Parameter:
-    about = reference(slot, scene_of(problem.runs[record]))
-    known = np.isfinite(np.diag(covariance))
-    unseen = np.eye(len(known))[~known]
-    value, low, high = interval_of(slot, z, np.where(known, covariance, 0.0), about, 1.959964, unseen)
-    return Parameter(slot.name, value, low, high, unit_of(problem, slot), "expected")

@@ -219,7 +219,7 @@ def describe(
     covariance = infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared))
     parameters = [
         _shared_parameter(problem, slot, shared[rows], uncertainty.covariance[rows, rows], quantile, blind, rows)
-        for slot, rows in _pieces(problem.shared)
+        for slot, rows in pieces(problem.shared)
     ]
     if problem.own:
         blocks = [own_covariance(linear, k, uncertainty.covariance) for k in range(len(problem.runs))]
@@ -243,7 +243,7 @@ def references(problem: Problem) -> list[np.ndarray]:
     return [np.asarray(reference(slot, scene_having(problem, slot))) for slot in (*problem.shared, *problem.own)]
 
 
-def _pieces(slots: tuple[Slot, ...], first: int = 0) -> list[tuple[Slot, slice]]:
+def pieces(slots: tuple[Slot, ...], first: int = 0) -> list[tuple[Slot, slice]]:
     """The numbers of z of each parameter, from `first` on."""
     ends = np.cumsum([first, *(slot.size for slot in slots)])
     return [(slot, slice(*pair)) for slot, *pair in zip(slots, ends[:-1], ends[1:], strict=True)]
@@ -261,7 +261,7 @@ def _shared_parameter(
 def _own_parameters(
     problem: Problem, own: np.ndarray, blocks: list[np.ndarray], quantile: float, blind: Sequence[Blind], shared: int
 ):
-    for (slot, rows), (_, of_z) in zip(_pieces(problem.own), _pieces(problem.own, shared), strict=True):
+    for (slot, rows), (_, of_z) in zip(pieces(problem.own), pieces(problem.own, shared), strict=True):
         unseen = unseen_of(blind, of_z)
         triples = [
             interval_of(slot, own[rows, k], blocks[k][rows, rows], reference(slot, scene_of(run)), quantile, unseen)
