@@ -3,7 +3,6 @@
 state -> forces -> flight -> contact [impact times -> impulses -> lever -> rest] -> state
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.branches import opaque_true
-from diffrigid.compiling import QUICK, is_own_program, uncollected
+from diffrigid.compiling import LASTING, QUICK, is_own_program, uncollected
 from diffrigid.contact.crowd import without_room
 from diffrigid.contact.strikes import ends, is_rolling
 from diffrigid.controls import as_controls
@@ -27,6 +26,9 @@ from diffrigid.trajectory import Trajectory
 from diffrigid.world import World, check, check_kinds
 
 MEMORY = 2**31  # [bytes] of states that reverse mode saves before it rather computes steps again
+MUCH = 100_000_000  # of `work`, from which a rollout of one world runs for longer than it compiles
+A_BODY = 100  # or a joint: as much work as to find so many numbers
+CALLS = 3000  # of `step`, as it is expected
 WORLDS = 1024  # for as many of them, under `jax.vmap`, there is room where the passes of one world are saved too
 
 
@@ -52,7 +54,7 @@ def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
     world, state = floats(world, state)
     controls = as_controls(world.forces, controls, state.x.dtype, (), state.x.shape[2:])
     inputs = world, state, step_length(dt, state, batch=True), controls
-    return _soon(inputs, _step_jit, _step_quick)(*inputs)
+    return STEP[_options(world, state, inputs, CALLS)](*inputs)
 
 
 @uncollected
@@ -98,7 +100,7 @@ def rollout(
         counts = _substeps(intervals, longest) if substeps is None else _given_substeps(substeps, len(intervals))
     controls = as_controls(world.forces, controls, state.x.dtype, (len(intervals),), state.x.shape[2:])
     inputs = world, state, intervals, controls
-    states = _soon(inputs, _rollout_jit, _rollout_quick)(*inputs, counts, memory)
+    states = ROLLOUT[_options(world, state, inputs, sum(counts))](*inputs, counts, memory)
     return Trajectory(t=t, state=states, world=world, controls=controls)
 
 
@@ -235,20 +237,27 @@ def _rollout(world, state, intervals, controls, counts, memory):
     return scan_steps(*aligned(world, state), intervals, controls, counts, memory)
 
 
-_step_jit, _step_quick = (jax.jit(_step, compiler_options=options) for options in (None, QUICK))
-_rollout_jit, _rollout_quick = (
-    jax.jit(_rollout, static_argnames=("counts", "memory"), compiler_options=options) for options in (None, QUICK)
+OPTIONS = QUICK, LASTING, None
+STEP = tuple(jax.jit(_step, compiler_options=options) for options in OPTIONS)
+ROLLOUT = tuple(
+    jax.jit(_rollout, static_argnames=("counts", "memory"), compiler_options=options) for options in OPTIONS
 )
 
 
-def _soon(inputs: tuple, plain: Callable, quick: Callable) -> Callable:
-    """The one that compiles sooner, where it may: for one world, which then runs about as fast.
+def _options(world: World, state: State, inputs: tuple, steps: int) -> int:
+    """Which of OPTIONS: for one world those that compile sooner; quickest where few steps, or small ones, are to run.
 
-    A batch, or a crowd, would not. Where it is differentiated, reverse mode makes a part of another program of it.
+    A batch, or a crowd, would not run as fast. What is differentiated may not have its own: reverse mode makes a part
+    of another program of it.
     """
-    world, state, *_ = inputs
-    one = state.x.ndim == 2 and not world.crowd
-    return quick if one and not traced(inputs) and is_own_program() else plain
+    if state.x.ndim > 2 or world.crowd or traced(inputs) or not is_own_program():
+        return 2
+    return int(steps * work(world) > MUCH)
+
+
+def work(world: World) -> int:
+    """How much a step is to compute, in numbers that its contacts find."""
+    return world.contact.saved_numbers(world) + A_BODY * (len(world.names) + sum(map(len, world.joint_names)))
 
 
 def scan_steps(
@@ -312,7 +321,7 @@ def saves_passes(world: World, state: State, steps: int, memory: int) -> bool:
     """
     if state.x.ndim > 2 or world.crowd:
         return False
-    return steps * world.contact.saved_numbers(world, state) * state.x.dtype.itemsize * WORLDS <= memory
+    return steps * world.contact.saved_numbers(world) * state.x.dtype.itemsize * WORLDS <= memory
 
 
 def _block_length(state: State, steps: int, memory: int) -> int:

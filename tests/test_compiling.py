@@ -11,7 +11,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
-from diffrigid.compiling import is_own_program
+from diffrigid.compiling import LASTING, QUICK, is_own_program
+from diffrigid.step import OPTIONS, _options
 
 SCRIPT = """
 import json
@@ -83,3 +84,23 @@ def test_quick_changes_the_time_to_compile_and_nothing_else():
     quick = jax.jit(slopes, compiler_options=dr.QUICK)(world, state)
     jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-15), quick, slopes(world, state))
     assert_allclose(quick[0].forces[0].g[..., 1].sum(), 0.1**2 / 2, rtol=1e-12)
+
+
+def test_what_runs_for_long_is_compiled_for_longer():
+    """A disc in free fall runs for a million steps in a second; ten boxes that may pile up for ten thousand in ten."""
+
+    def options(shape, count, steps):
+        bodies = {f"{i}": dr.Body(shape, mass=1.0, x=(0.0, 3.0 * i)) for i in range(count)}
+        world, state = dr.scene(bodies, gravity=(0.0, -9.81))
+        return OPTIONS[_options(world, state, (), steps)]
+
+    disc, box = dr.Disc(radius=0.2), dr.Box(half=(0.5, 0.5))
+    assert options(disc, 1, 100_000) is QUICK
+    assert [options(box, 10, steps) for steps in (1000, 10_000)] == [QUICK, LASTING]
+
+    def traced(x):
+        world, state = dr.scene({"disc": dr.Body(disc, mass=1.0, x=(0.0, 1.0))})
+        assert OPTIONS[_options(world, state, (), 1)] is None  # JAX would refuse it options of its own
+        return x
+
+    jax.jit(traced)(1.0)

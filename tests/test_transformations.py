@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.pytree import pytree
-from diffrigid.step import WORLDS, _rollout_quick, _step_quick, floats
+from diffrigid.step import ROLLOUT, STEP, WORLDS, floats
 
 ROUNDING = 1e-11  # absolute, of values about 1: the same operations in another order
 EXACT = 1e-9  # relative: rounding of a few hundred steps
@@ -51,7 +51,7 @@ def test_jit_is_no_jit():
 def test_what_reverse_mode_saves():
     """The passes of all steps, or only the states between them, as memory allows: the same slopes."""
     world, state = floats(*made(disc_and_plane, RUB))
-    room = STEPS * world.contact.saved_numbers(world, state) * state.x.dtype.itemsize
+    room = STEPS * world.contact.saved_numbers(world) * state.x.dtype.itemsize
     saved, slopes = [], []
     for memory in (WORLDS * room, WORLDS * room - 1):
 
@@ -125,13 +125,14 @@ def test_other_values_do_not_compile_again():
         floor = dr.Static(dr.HalfSpace(normal=(0, 1)))
         return dr.scene({"ball": ball, "floor": floor}, gravity=gravity, restitution=e)
 
-    before = _rollout_quick._cache_size(), _step_quick._cache_size()
+    quick = ROLLOUT[0], STEP[0]
+    before = [fn._cache_size() for fn in quick]
     for values, dt in (((1, 2, (0, -10), 0), 0.01), ((0.5, np.float32(2.5), (0.1, -9.81), 0.7), np.float64(0.02))):
         world, state = scene(*values)
         dr.rollout(world, state, dt=dt, steps=3)
         dr.rollout(dr.replace(world, contact=dr.Contact(width=dt)), state, dt=dt, steps=3)
         dr.step(world, state, dt)
-    assert (_rollout_quick._cache_size(), _step_quick._cache_size()) == (before[0] + 1, before[1] + 1)
+    assert [fn._cache_size() for fn in quick] == [count + 1 for count in before]
 
 
 def test_float32_stays_float32():

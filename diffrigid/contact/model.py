@@ -146,11 +146,11 @@ class Contact:
         impacts, loaded = self.sweeps + HOLDS * waits(world), is_loaded(world)
         return [IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH]
 
-    def saved_numbers(self, world: Any, state: State) -> int:
+    def saved_numbers(self, world: Any) -> int:
         """About how many numbers reverse mode has to save of a step (FOUND, PASSED) to compute none of it again."""
         if not ends(world)["a"]:
             return 0
-        of_bodies = sum(leaf.size for leaf in jax.tree.leaves(state)) + 2 * len(state.x)
+        of_bodies = (6 * world.dim - 3) * len(world.names)  # their states, and times
         of_rows = (5 * world.dim + 8) * _rows(world)  # impulses found, twice, and known, times, gaps
         return len(self._phases(world)) * (of_bodies + of_rows)
 

@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jax import Array
 
-from diffrigid.compiling import QUICK, uncollected
+from diffrigid.compiling import LASTING, uncollected
 from diffrigid.step import at_least_one
 from diffrigid.sysid.levenberg import INTERRUPTED, UNFINISHED, Numbers, Point, point_at
 from diffrigid.sysid.problem import Group, Plan, residuals_of
@@ -88,7 +88,7 @@ def cost_and_slope(groups: Sequence[Group], z: Numbers, loss: Any) -> tuple[Arra
 
 
 @uncollected
-@partial(jax.jit, static_argnames=("plan", "loss"), compiler_options=QUICK)
+@partial(jax.jit, static_argnames=("plan", "loss"), compiler_options=LASTING)
 def _group_slope(plan: Plan, loss: Any, z: Array, data: Any) -> tuple[Array, Array]:
     def cost(z):
         by_start = loss.rho(residuals_of(plan, z, data)).sum((0, 1))

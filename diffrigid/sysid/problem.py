@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from diffrigid.compiling import QUICK, QUICKEST, uncollected
+from diffrigid.compiling import LASTING, QUICK, uncollected
 from diffrigid.devices import cut, devices, everywhere, join, over_devices, pieces_of
 from diffrigid.pytree import replace
 from diffrigid.state import State
-from diffrigid.step import aligned, scan_steps
+from diffrigid.step import aligned, scan_steps, work
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
 from diffrigid.sysid.records import Run, Series
@@ -29,7 +29,7 @@ from diffrigid.sysid.sensors import Part, difference, is_angle
 from diffrigid.sysid.times import controls_over, grid
 
 LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are looked at
-LITTLE = 20_000  # steps of all records, starts and directions, up to which compiling takes longer than running a fit
+LITTLE = 10_000_000  # of work in all records, starts and directions, up to which a fit compiles for longer than it runs
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
 def _compiled(fn: Callable) -> tuple[Callable, ...]:
     """`fn` compiled as soon as can be, and to run sooner."""
     return tuple(
-        uncollected(jax.jit(fn, static_argnames="plan", compiler_options=options)) for options in (QUICKEST, QUICK)
+        uncollected(jax.jit(fn, static_argnames="plan", compiler_options=options)) for options in (QUICK, LASTING)
     )
 
 
@@ -271,7 +271,7 @@ def evaluate(plan: Plan, z: Array, data: Data) -> Array:
 
 def _is_much(z: Array, data: Data) -> bool:
     """Whether to simulate it in the directions of all numbers z takes longer than to compile."""
-    return z.size * len(data.lengths) > LITTLE
+    return z.size * len(data.lengths) * work(data.scene.world) > LITTLE
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:
