@@ -253,3 +253,27 @@ def test_friction_turns_back_with_the_motion():
     value, slopes = jax.jit(with_slopes(place))(*p)
     assert_allclose(value, expected(*p), atol=5e-5)
     assert_allclose(slopes, jax.grad(expected, (0, 1, 2))(*p), atol=5e-5)
+
+
+@pytest.mark.parametrize("speed", [0.0, 50.0])
+def test_what_a_joint_of_a_linkage_does_acts_in_the_middle_of_a_step(speed):
+    """The friction, or a motor, of the second hinge of a swinging chain, beside the same moment as a `Torque`.
+
+    Between two bodies on one chain it was of first order as long as the chain answered it as it is at the end.
+    """
+    first, moment = np.array([-0.5, 0.0]), 0.8 if speed else -0.8
+    hook, arm = np.array([0.4, 0.1]), np.array([-0.3, 0.0])
+    bodies = {
+        "upper": dr.Body(None, mass=1.3, inertia=0.1, x=-first, v=(0.0, 0.5), w=1.0),
+        "lower": dr.Body(None, mass=0.7, inertia=0.05, x=hook - first - arm, v=(-0.1, 2.4), w=5.0),
+    }
+
+    def end(forces, dt, **along):
+        joints = [dr.Revolute("upper", anchor_a=first), dr.Revolute("lower", "upper", anchor_a=arm, **along)]
+        world, state = dr.scene(bodies, gravity=(0.0, -9.81), joints=joints, forces=forces)
+        state = dr.rollout(world, state, dt=dt, steps=round(0.2 / dt)).state
+        return jnp.concatenate([state.v[-1].ravel(), state.w[-1].ravel()])
+
+    exact = end([dr.Torque(body="lower", tau=moment), dr.Torque(body="upper", tau=-moment)], 1 / 960)
+    coarse, fine = (jnp.abs(end([], dt, friction=0.8, speed=speed) - exact).max() for dt in (1 / 60, 1 / 240))
+    assert coarse < 1e-3 and fine < coarse / 12, (coarse, fine)

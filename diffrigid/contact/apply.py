@@ -56,7 +56,7 @@ def apply_impulses(
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
     # Displacement per change of velocity [s]: a force that has acted evenly has its centroid in the middle.
     lever = jnp.where(kick > 0, jnp.where(evenly > 0, 0.5 * (t - flight.t0), 0.0), 1.0)
-    q, mobility, link = _posed(world, flight, t)
+    q, mobility, link = _posed(world, flight, t, jnp.where(kick > 0, lever, 0.0))
     onto = None if link is None else _onto_joints(flight, t, link, (count > 0) & (kick > 0))
     if onto is not None:
         strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
@@ -124,13 +124,24 @@ def _onto_joints(flight: Flight, t: Array, link: Linkage, hit: Array) -> tuple[A
     return spread(link, on * v, on * jax.vmap(apply)(link.inverse_inertia, L))
 
 
-def _posed(world: Any, flight: Flight, t: Array) -> tuple[Array, Mobility, Linkage | None]:
-    """Orientations of all bodies, each at its own time t (N, *batch), their mobility there, and their joints."""
-    q, so = jax.vmap(orientation)(flight, t), rotations(flight.dim)
+def _posed(world: Any, flight: Flight, t: Array, ago: Array) -> tuple[Array, Mobility, Linkage | None]:
+    """Orientations of all bodies, each at its own time t (N, *batch), their mobility there, and their joints.
+
+    Args:
+        ago: (N, *batch) [s] how long before t impulses act.
+    """
+    so = rotations(flight.dim)
+
+    def linked(t: Array) -> tuple[Array, Linkage]:
+        q = jax.vmap(orientation)(flight, t)
+        return q, linkage(world.joints, world.statics, world.bodies, jax.vmap(position)(flight, t), q)
+
     if world.joints:
-        link = linkage(world.joints, world.statics, world.bodies, jax.vmap(position)(flight, t), q)
+        q, link = linked(t)
         joined = frozenset(end for ends in ends_of(world.joints) for end in ends if end < len(q))
-        return q, jointed(link, jax.vmap(so.world_inverse)(world.bodies.inertia, q), joined), link
+        inertia = jax.vmap(so.world_inverse)(world.bodies.inertia, q)
+        return q, jointed(link, linked(t - ago)[1], inertia, joined), link
+    q = jax.vmap(orientation)(flight, t)
     inverse = jax.vmap(so.world_inverse)(flight.inverse_inertia, q)
     return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse), None
 

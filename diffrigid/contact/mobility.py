@@ -89,23 +89,33 @@ def _joined(parts: list[Array]) -> Array:
     return jnp.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
-def jointed(link: Linkage, inertia: Array, joined: frozenset[int]) -> Mobility:
+def jointed(link: Linkage, then: Linkage, inertia: Array, joined: frozenset[int]) -> Mobility:
     """Of bodies some of which are `joined`, with inertias in world axes.
 
+    An impulse is answered by the joints as they are when it acts, `then`, and the momentum that this leaves by those at
+    the end, `link`. With one answer a force that acts evenly over a step, in its middle, would be of first order only.
     G is used so often that it is made once, column by column.
     """
     moving, *batch = link.inverse_mass.shape
     D, size = link.groups[0].a.x.shape[1], link.sides.shape[3]
     units = jnp.eye(moving * size, dtype=inertia.dtype).reshape(-1, moving, size, *[1] * len(batch))
     units = units + jnp.zeros_like(link.inverse_mass)[None, :, None]
-    free = Mobility(inverse_mass=link.inverse_mass, inverse_inertia=link.inverse_inertia)
+
+    def answered(at: Linkage, dp: Array, dL: Array) -> tuple[Array, Array, Array]:
+        dv, dw, _ = velocities(free(at), dp, dL)
+        by_joints = spread(at, dv, dw)
+        return dv + by_joints[0], dw + by_joints[1], dL + by_joints[2]
 
     def twist(unit: Array) -> Array:
-        dv, dw, _ = velocities(free, unit[:, :D], unit[:, D:])
-        more = spread(link, dv, dw)
-        return jnp.concatenate([dv + more[0], dw + more[1]], axis=1).reshape(-1, *batch)
+        dv, _, dL = answered(then, unit[:, :D], unit[:, D:])
+        return jnp.concatenate(answered(link, dv / link.inverse_mass[:, None], dL)[:2], axis=1).reshape(-1, *batch)
 
-    return replace(free, inertia=inertia, matrix=jax.vmap(twist, out_axes=1)(units), joined=joined)
+    return replace(free(link), inertia=inertia, matrix=jax.vmap(twist, out_axes=1)(units), joined=joined)
+
+
+def free(link: Linkage) -> Mobility:
+    """Of its bodies without their joints."""
+    return Mobility(inverse_mass=link.inverse_mass, inverse_inertia=link.inverse_inertia)
 
 
 @jax.jit
