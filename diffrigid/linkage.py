@@ -11,7 +11,7 @@ Source: Witkin, Physically Based Modeling: Constrained Dynamics, SIGGRAPH 1997 c
 """
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from types import ModuleType
 from typing import Any
 
@@ -192,22 +192,52 @@ def _twists(state: State) -> Array:
 
 def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array, span: Array) -> Array:
     """Forces and torques on all bodies (N, D + A, *batch) with those added of the damping of joints."""
-    so = rotations(link.groups[0].a.x.shape[1])
+    for group, at in zip(joints, link.groups, strict=True):
+        if is_damped(group):
+            forces = forces + _damping(group, at, link, twists, lambda rate: _resolved(rate * span))
+    return forces
+
+
+def is_damped(group: Any) -> bool:
+    """Whether there is damping in a group of joints. Static."""
+    return getattr(group, "damping", None) is not None
+
+
+def damped_later(joints: tuple, link: Linkage, twists: Array, momentum: Array, later: Array) -> Array:
+    """Momentum of all bodies (N, D + A, *batch), that gave them `twists`, after the damping of joints took of it.
+
+    Args:
+        later: (N, *batch) [s] for which damping has acted since, alike for bodies that hang together.
+    """
+    span, taken = later.max(0), jnp.zeros_like(momentum)
+
+    def implicit(rate: Array) -> Array:
+        share = _resolved(2.0 * rate * span)
+        return share / (1.0 + share * rate * span)
+
+    for group, at in zip(joints, link.groups, strict=True):
+        if is_damped(group):
+            taken = taken + _damping(group, at, link, twists, implicit)
+    return momentum + later[:, None] * taken
+
+
+def _damping(group: Any, at: PlacedJoints, link: Linkage, twists: Array, share: Callable[[Array], Array]) -> Array:
+    """Forces and torques on all bodies (N, D + A, *batch) by the damping of a group of joints.
+
+    Args:
+        share: of a damping that counts, by the rate [1/s] at which it alone would slow its joint.
+    """
+    so, ends = rotations(at.a.x.shape[1]), ends_of((group,))
 
     def resisting(joint: Any, a: Pose, b: Pose, u: Array, mass: Array, inertia: Array) -> Array:
         along = by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0].reshape(u.shape)
         turn = along[:, so.D :]
         mobile = (mass * (along[:, : so.D] ** 2).sum(1)).sum(0) + (turn * jax.vmap(so.apply)(inertia, turn)).sum((0, 1))
-        damping = joint.damping * _resolved(joint.damping * mobile * span)
+        damping = joint.damping * share(joint.damping * mobile)
         return -(damping * (along * u).sum((0, 1)))[None, None] * along
 
-    for group, at in zip(joints, link.groups, strict=True):
-        if getattr(group, "damping", None) is not None:
-            ends = ends_of((group,))
-            of_both = (to_sides(ends, leaf) for leaf in (twists, link.inverse_mass, link.inverse_inertia))
-            resistance = of_each(resisting, (at,), *of_both)
-            forces = forces + _by_body(ends, len(forces), resistance)
-    return forces
+    of_both = (to_sides(ends, leaf) for leaf in (twists, link.inverse_mass, link.inverse_inertia))
+    return _by_body(ends, len(twists), of_each(resisting, (at,), *of_both))
 
 
 def _resolved(steps: Array) -> Array:

@@ -108,6 +108,23 @@ def test_damping_is_exponential():
     )
 
 
+def test_damping_slows_what_friction_leaves():
+    """A slider with both, v = (v0 + F / c) exp(-c t / m) - F / c: the damping acts on what friction has done so far."""
+    t, F = 0.5, 2.0
+
+    def end(c, v):
+        body = dr.Body(None, mass=1.0, inertia=1.0, x=(0.0, 0.0), v=v * jnp.array([0.6, 0.8]))
+        slider = dr.Prismatic("body", None, axis_b=(0.6, 0.8), friction=F, damping=c)
+        state = dr.rollout(*dr.scene({"body": body}, joints=[slider]), dt=1 / RATE, steps=round(t * RATE)).state
+        return jnp.stack([jnp.sqrt((state.x[-1, 0] ** 2).sum()), jnp.sqrt((state.v[-1, 0] ** 2).sum())])
+
+    def expected(c, v):
+        all_of_it = (v + F / c) * jnp.array([-jnp.expm1(-c * t) / c, jnp.exp(-c * t)])
+        return all_of_it - F / c * jnp.array([t, 1.0])
+
+    check_with_slopes(end, expected, (0.8, 3.0), atol=3e-5)
+
+
 def test_a_damping_that_no_step_resolves_stops_the_joint():
     """It acts within a thousandth of a step: an explicit integration would throw the wheel about, without bound."""
     value, slope = jax.jit(with_slopes(lambda damping: turned(wheel(1.7, damping=damping), 1.0)[:2]))(jnp.asarray(3e4))

@@ -140,7 +140,7 @@ def _posed(world: Any, flight: Flight, t: Array, ago: Array) -> tuple[Array, Mob
         q, link = linked(t)
         joined = frozenset(end for ends in ends_of(world.joints) for end in ends if end < len(q))
         inertia = jax.vmap(so.world_inverse)(world.bodies.inertia, q)
-        return q, jointed(link, linked(t - ago)[1], inertia, joined), link
+        return q, jointed(world.joints, link, linked(t - ago)[1], ago, inertia, joined), link
     q = jax.vmap(orientation)(flight, t)
     inverse = jax.vmap(so.world_inverse)(flight.inverse_inertia, q)
     return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse), None

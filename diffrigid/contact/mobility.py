@@ -13,7 +13,7 @@ from diffrigid.contact.cone import put
 from diffrigid.contact.sides import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
 from diffrigid.gathers import sum_rows
 from diffrigid.linear import identity, matvec
-from diffrigid.linkage import Linkage, spread
+from diffrigid.linkage import Linkage, damped_later, is_damped, spread
 from diffrigid.numerics import dot, unit_vector
 from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import rotations
@@ -89,12 +89,14 @@ def _joined(parts: list[Array]) -> Array:
     return jnp.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
-def jointed(link: Linkage, then: Linkage, inertia: Array, joined: frozenset[int]) -> Mobility:
+def jointed(
+    joints: tuple, link: Linkage, then: Linkage, ago: Array, inertia: Array, joined: frozenset[int]
+) -> Mobility:
     """Of bodies some of which are `joined`, with inertias in world axes.
 
-    An impulse is answered by the joints as they are when it acts, `then`, and the momentum that this leaves by those at
-    the end, `link`. With one answer a force that acts evenly over a step, in its middle, would be of first order only.
-    G is used so often that it is made once, column by column.
+    An impulse is answered by the joints as they are when it acts, `then`, the time `ago` (N, *batch) [s] before the
+    end; by their damping since; and by those at the end, `link`. With one answer a force that acts evenly over a step,
+    in its middle, would be of first order only. G is used so often that it is made once, column by column.
     """
     moving, *batch = link.inverse_mass.shape
     D, size = link.groups[0].a.x.shape[1], link.sides.shape[3]
@@ -107,8 +109,11 @@ def jointed(link: Linkage, then: Linkage, inertia: Array, joined: frozenset[int]
         return dv + by_joints[0], dw + by_joints[1], dL + by_joints[2]
 
     def twist(unit: Array) -> Array:
-        dv, _, dL = answered(then, unit[:, :D], unit[:, D:])
-        return jnp.concatenate(answered(link, dv / link.inverse_mass[:, None], dL)[:2], axis=1).reshape(-1, *batch)
+        dv, dw, dL = answered(then, unit[:, :D], unit[:, D:])
+        momentum = jnp.concatenate([dv / link.inverse_mass[:, None], dL], axis=1)
+        if any(map(is_damped, joints)):
+            momentum = damped_later(joints, then, jnp.concatenate([dv, dw], axis=1), momentum, ago)
+        return jnp.concatenate(answered(link, momentum[:, :D], momentum[:, D:])[:2], axis=1).reshape(-1, *batch)
 
     return replace(free(link), inertia=inertia, matrix=jax.vmap(twist, out_axes=1)(units), joined=joined)
 
