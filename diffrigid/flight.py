@@ -68,7 +68,7 @@ def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Fli
     )  # fmt: skip
     if not varies:
         return flight
-    return _along(flight, *_runge_kutta(world, flight, controls, t1[None] - t0), t1[None] - t0, _has_torque(world))
+    return _along(flight, *_runge_kutta(world, flight, controls, t1[None] - t0), t1[None] - t0, has_torque(world))
 
 
 def _wrench(world: Any, state: State, controls: Any, span: Array) -> Wrench:
@@ -87,7 +87,8 @@ class Motion:
     L: Array = array("N", "A")
 
 
-def _has_torque(world: Any) -> bool:
+def has_torque(world: Any) -> bool:
+    """Whether joints or forces act on a body beside its centre, or turn it. Static."""
     return bool(world.joints) or any(getattr(force, "twists", True) for force in world.forces)
 
 

@@ -539,6 +539,23 @@ def test_only_numbers_without_an_interval_are_said_not_to_be_determined():
     assert [row[-1] for row in rows_of(p)] == ["", BLIND]
 
 
+@pytest.mark.parametrize("free", ["box.mass", "box.density"])
+def test_a_mass_that_leaves_the_inertia_of_a_solid_body_is_noticed(free):
+    """A box on a spring, twice as heavy as it is said to be."""
+    box = dr.Body(dr.Box(half=(0.2, 0.1)), mass=1.0, x=(1.0, 0.0))
+    spring = dr.SpringDamper(a="box", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=8.0)
+    t = np.arange(40) / 30
+    data = {"t": t, "box.x[0]": np.cos(2.0 * t)}
+    found = dr.fit(*dr.scene({"box": box}, forces=[spring]), data, free={free: dr.positive()}, progress=False)
+    assert_allclose(found.world.bodies.mass, 2.0, rtol=1e-4)
+    inertia = 2.0 * (0.2**2 + 0.1**2) / 3
+    if free == "box.density":
+        assert_allclose(found.world.bodies.inertia, inertia, rtol=1e-4)
+        assert not [note for note in found.notes if "density" in note]
+    else:
+        assert [note for note in found.notes if note.startswith("box.mass is 2 times what it was, box.inertia is as")]
+
+
 def test_degrees_in_a_column_of_angles_are_noticed():
     wheel = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 0.0), w=1.0)
     t = np.arange(60) / 30

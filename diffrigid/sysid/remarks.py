@@ -5,16 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffrigid.constraints import joint_errors, placed
+from diffrigid.flight import has_torque
 from diffrigid.joint_motion import fields_of, moving_side
+from diffrigid.paths import catalogue, read, write
+from diffrigid.shapes import Disc, Sphere
 from diffrigid.state import rotations
 from diffrigid.sysid.diagnosis import RARE, whiteness
 from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.problem import full_turn
 from diffrigid.sysid.records import Run
 from diffrigid.sysid.setup import Problem
+from diffrigid.world import World
 
 AS_LARGE = 0.5  # [-] of the spread of a column: residuals from which on, if they follow each other, nothing is fitted
 ANYWHERE = 0.25  # [-] of a turn: angles that are anywhere have residuals of 1 / sqrt(12) of one
+OTHER = 1.1  # times the mass that a solid body had, from which on the inertia that it keeps is doubted
 TORN = 1e-3  # [m or rad] by which a joint may be off at the fitted start
 
 
@@ -37,7 +42,7 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
             f"this is no fit: residuals of {', '.join(dict.fromkeys(names))} are as large as the motion; look at units "
             "(m, s, rad; degrees need scale=180 / pi) and at the values to begin with, or try more starts"
         )
-    out += _torn(scenes[0])
+    out += _torn(scenes[0]) + _light_inertia(problem, scenes[0])
     if np.isfinite(problem.window):
         out.append(f"only the first {problem.window:g} s of each record are fitted")
     return out
@@ -72,3 +77,32 @@ def _torn(scene: Scene) -> list[str]:
         for (name, own), size in zip(joints, np.abs(errors).max(1), strict=True)
         if size > TORN
     ]
+
+
+def _light_inertia(problem: Problem, scene: Scene) -> list[str]:
+    """Solid bodies that have another mass now, and the inertia that they had."""
+    before, after = problem.runs[0], scene.world
+    paths = {path for slot in (*problem.shared, *problem.own) for path in slot.paths}
+    out = []
+    for i, name in enumerate(after.names):
+        if f"{name}.mass" not in paths or f"{name}.density" not in catalogue(after):
+            continue
+        solid = write(
+            before.world, before.state, f"{name}.density", read(before.world, before.state, f"{name}.density")
+        )
+        was, would_be, is_now = (np.asarray(world.bodies.inertia[i]) for world in (before.world, solid[0], after))
+        factor = float(after.bodies.mass[i] / before.world.bodies.mass[i])
+        kept = np.allclose(was, would_be) and (is_now == was).all()
+        if kept and max(factor, 1.0 / factor) > OTHER and _is_turned(after, i):
+            out.append(
+                f"{name}.mass is {factor:.2g} times what it was, {name}.inertia is as it was: where {name} is solid, "
+                f"free {name}.density instead, which sets both"
+            )
+    return out
+
+
+def _is_turned(world: World, body: int) -> bool:
+    """Whether anything can turn a body: friction, joints, forces that act on it beside its centre, or its shape."""
+    (shape,) = (shape for shape, owners in zip(world.shapes, world.owners, strict=True) if body in owners)
+    rubs = bool((np.asarray(world.bodies.friction) > 0).any() or (np.asarray(world.statics.friction) > 0).any())
+    return rubs or bool(world.joints) or has_torque(world) or not isinstance(shape, Disc | Sphere)
