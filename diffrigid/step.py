@@ -247,10 +247,11 @@ ROLLOUT = tuple(
 def _options(world: World, state: State, inputs: tuple, steps: int) -> int:
     """Which of OPTIONS: for one world those that compile sooner; quickest where few steps, or small ones, are to run.
 
-    A batch, or a crowd, would not run as fast. What is differentiated may not have its own: reverse mode makes a part
-    of another program of it.
+    A batch, or a crowd, would not run as fast, nor a GPU. What is differentiated may not have its own: reverse mode
+    makes a part of another program of it.
     """
-    if state.x.ndim > 2 or world.crowd or traced(inputs) or not is_own_program():
+    alone = state.x.ndim == 2 and not world.crowd and jax.default_backend() == "cpu"
+    if not alone or traced(inputs) or not is_own_program():
         return 2
     return int(steps * work(world) > MUCH)
 

@@ -270,8 +270,8 @@ def evaluate(plan: Plan, z: Array, data: Data) -> Array:
 
 
 def _is_much(z: Array, data: Data) -> bool:
-    """Whether to simulate it in the directions of all numbers z takes longer than to compile."""
-    return z.size * len(data.lengths) * work(data.scene.world) > LITTLE
+    """Whether to simulate it in the directions of all numbers z takes longer than to compile, or is for a GPU."""
+    return jax.default_backend() != "cpu" or z.size * len(data.lengths) * work(data.scene.world) > LITTLE
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:
