@@ -325,6 +325,7 @@ def test_profile_says_where_it_is_open():
     size = np.linalg.norm(by_c - by_k * (by_k @ by_c) / (by_k @ by_k)) / sigma
     assert profile.open == ("below",) and profile.low == 0.0
     assert_allclose(profile.high, 1.96 / size, rtol=0.01)  # between values that are refined twice
+    assert f"0 to {profile.high:.5g} (profile, open below)" in repr(profile)
     table = repr(sysid.with_profiles(found, [profile]))
     assert "profile, open below" in table and f"0 .. {profile.high:.3g}" in table
 

@@ -38,6 +38,12 @@ class Profile:
         """What to say in a table."""
         return f"profile, open {' and '.join(self.open)}" if self.open else "profile"
 
+    def __repr__(self) -> str:
+        interval = f"{self.name}: 95 % interval {self.low:.5g} to {self.high:.5g} ({self.note})"
+        head = f"{'value':>12} {'rise':>12}   of the cost; at the ends of the interval {self.level:.3g}"
+        rows = (f"{value:12.5g} {rise:12.4g}" for value, rise in zip(self.values, self.rise, strict=True))
+        return "\n".join([interval, head, *rows])
+
 
 def profile(fit: Fit, name: str, points: int = 9) -> Profile:
     """Profile of a shared number, its interval being where the cost rises by less than t^2 / 2.
