@@ -176,6 +176,7 @@ def test_a_change_that_two_numbers_share_is_written_out():
     fit = dr.fit(*dr.scene(body), data, free={"p.x": dr.real(), "p.x.bias": dr.real()}, progress=False)
     assert sum("change together without effect" in note for note in fit.notes) == 2
     assert_allclose(fit["p.x"].value + fit["p.x.bias"].value, (0.3, 0.0), atol=2e-3)
+    assert fit["p.x.bias"].unit == "m"
 
 
 # ---- a body that tumbles in space under a known torque

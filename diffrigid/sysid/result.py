@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffrigid.paths import unit
+from diffrigid.paths import component, unit
 from diffrigid.state import State
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
 from diffrigid.sysid.diagnosis import (
@@ -311,9 +311,12 @@ def interval_of(
 
 
 def unit_of(problem: Problem, slot: Slot) -> str:
-    """SI unit; that of a column's bias or of what it observes is the user's."""
-    path = slot.paths[0]
-    return "s" if path.split(".")[-1] == "clock" else unit(scene_having(problem, slot).world, path)
+    """SI unit; that of a column is the user's, unless the column is a quantity by its name, and not scaled."""
+    path, scene = slot.paths[0], scene_having(problem, slot)
+    column, _, field = component(path)[0].rpartition(".")
+    if field == "bias" and np.all(np.asarray(scene.channels[column].scale) == 1):
+        return unit(scene.world, column)
+    return "s" if field == "clock" else unit(scene.world, path)
 
 
 def _together(covariance: np.ndarray, places, blind) -> list[str]:
