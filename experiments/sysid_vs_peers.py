@@ -16,22 +16,22 @@ the Jacobian; 64 steps a frame (pymunk and Box2D are then 0.6 and 0.3 mm from th
 steps a frame; softer springs bias it (1e5: restitution by 0.007). Its own differences are on one side only.
 "As it comes" leaves the optimiser as it is.
 
-Result (2026-11-22, 40 records; mujoco 4.0.0, pymunk 7.3.1, pyb2d3 0.11.1, scipy 1.17.1, jaxlib 0.10.1; two cores of an
-AMD EPYC beside other work, so CPU-seconds are good to some tens of per cent):
+Result (2026-11-26, 40 records; mujoco 4.0.0, pymunk 7.3.1, pyb2d3 0.11.1, scipy 1.17.1, jaxlib 0.10.1; one core of a
+Zen 5 beside other work, so CPU-seconds are good to some tens of per cent):
 
                                      success  in interval  error e, mass     CPU-s: answer, one fit more
-    diffrigid                           98 %        95 %    0.0005  0.0008      10.4     0.22
-    diffrigid, exact impacts only       98 %        95 %    0.0004  0.0008       9.7     0.08
-    mujoco.sysid, as it comes            0 %          -                         41.8     4.87
-    mujoco.sysid, large differences     45 %        40 %    0.0026  0.0036      50.0     6.43
+    diffrigid                           98 %        95 %    0.0005  0.0008       7.5     0.22
+    diffrigid, exact impacts only      100 %        95 %    0.0005  0.0008       6.5     0.08
+    mujoco.sysid, as it comes            0 %          -                         40.5     4.83
+    mujoco.sysid, large differences     45 %        40 %    0.0026  0.0036      49.3     6.34
     pymunk, as SciPy comes              60 %        29 %    0.0023  0.0046       1.9     0.16
-    pymunk, large differences           98 %        95 %    0.0006  0.0009       7.0     0.89
+    pymunk, large differences           98 %        95 %    0.0006  0.0009       6.7     0.92
     Box2D v3, as SciPy comes             0 %          -                          1.2     0.06
-    Box2D v3, large differences         98 %        95 %    0.0005  0.0010       8.4     1.10
+    Box2D v3, large differences         98 %        95 %    0.0005  0.0010       8.5     1.10
 
-So on this small job pymunk and Box2D find the same once their differences are large, in less time, most of that of
-diffrigid being compiling; it needs no step of differences and is five times faster from then on. Box2D computes in
-float32, in which a difference of 1.5e-8 is none. MuJoCo's step is 0.01 or 1 % of a number, the larger: 10 % of v_y.
+So on this small job pymunk and Box2D find the same once their differences are large, in about the same time, most of
+that of diffrigid being compiling; it needs no step of differences and is four times faster from then on. Box2D computes
+in float32, in which a difference of 1.5e-8 is none. MuJoCo's step is 0.01 or 1 % of a number, the larger: 10 % of v_y.
 With v_y in units of 0.1 m/s 3 of the first 6 records are found instead of 2, and with SciPy and the settings of
 pymunk on its rollouts 1 of the first 4; starts that fail end at a bound of the restitution or far from it. There may
 be better ones.
