@@ -20,7 +20,17 @@ from diffrigid.devices import cut, devices, join, over_devices, pieces_of
 from diffrigid.pytree import map_arrays
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State
-from diffrigid.step import MEMORY, aligned, at_least_one, final_state, floats, scan_steps, step_length
+from diffrigid.step import (
+    MEMORY,
+    OPTIONS,
+    aligned,
+    at_least_one,
+    final_state,
+    floats,
+    options_for,
+    scan_steps,
+    step_length,
+)
 from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
 LANES = 2**15  # of a chunk: one for each contact, or more, and four for each body of its worlds
@@ -75,7 +85,8 @@ def rollout_batch(
     if chunk is None:
         least = 2 * int(np.sqrt(steps)) * _state_bytes(world, state)  # of one world, saved at every so many steps
         most = max(min(most, memory // least), 1)
-    return _run(world, state, controls, length, steps, final_only, count, pieces_of(count, most), memory)
+    inputs = world, state, controls, length
+    return RUN[options_for(inputs, steps, count)](*inputs, steps, final_only, count, pieces_of(count, most), memory)
 
 
 def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -> Any:
@@ -146,7 +157,6 @@ def _batch_axes(world: World, controls: Any, count: int) -> list[int | None]:
     return [leaf.ndim - 1 if many else None for many, (_, leaf) in zip(own, leaves, strict=True)]
 
 
-@jax.jit(static_argnames=("steps", "final_only", "count", "pieces", "memory"))
 def _run(world, state, controls, dt, steps, final_only, count, pieces, memory):
     leaves, tree = jax.tree.flatten((world, state, controls))
     batched = jax.tree.leaves(map_arrays(lambda leaf, letters, _: leaf.ndim > len(letters), (world, state)))
@@ -169,3 +179,7 @@ def _run(world, state, controls, dt, steps, final_only, count, pieces, memory):
         return lax.map(lambda own: one_chunk(own, *whole), parts)
 
     return jax.tree.map(lambda leaf: join(leaf, 0, count), over_devices(chunks, split, (alike, dt)))
+
+
+STATIC = ("steps", "final_only", "count", "pieces", "memory")
+RUN = tuple(jax.jit(_run, static_argnames=STATIC, compiler_options=options) for options in OPTIONS)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.branches import opaque_true
-from diffrigid.compiling import LASTING, QUICK, is_own_program, uncollected
+from diffrigid.compiling import LASTING, QUICK, is_for_speed, is_own_program, uncollected
 from diffrigid.contact.crowd import without_room
 from diffrigid.contact.strikes import ends, is_rolling
 from diffrigid.controls import as_controls
@@ -26,7 +26,7 @@ from diffrigid.trajectory import Trajectory
 from diffrigid.world import World, check, check_kinds
 
 MEMORY = 2**31  # [bytes] of states that reverse mode saves before it rather computes steps again
-MUCH = 100_000_000  # of `work`, from which a rollout of one world runs for longer than it compiles
+MUCH = 100_000_000  # of `work`, from which it pays to compile for longer
 A_BODY = 100  # or a joint: as much work as to find so many numbers
 CALLS = 3000  # of `step`, as it is expected
 WORLDS = 1024  # for as many of them, under `jax.vmap`, there is room where the passes of one world are saved too
@@ -54,7 +54,7 @@ def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
     world, state = floats(world, state)
     controls = as_controls(world.forces, controls, state.x.dtype, (), state.x.shape[2:])
     inputs = world, state, step_length(dt, state, batch=True), controls
-    return STEP[_options(world, state, inputs, CALLS)](*inputs)
+    return STEP[options_for(inputs, CALLS, _worlds(state))](*inputs)
 
 
 @uncollected
@@ -100,7 +100,7 @@ def rollout(
         counts = _substeps(intervals, longest) if substeps is None else _given_substeps(substeps, len(intervals))
     controls = as_controls(world.forces, controls, state.x.dtype, (len(intervals),), state.x.shape[2:])
     inputs = world, state, intervals, controls
-    states = ROLLOUT[_options(world, state, inputs, sum(counts))](*inputs, counts, memory)
+    states = ROLLOUT[options_for(inputs, sum(counts), _worlds(state))](*inputs, counts, memory)
     return Trajectory(t=t, state=states, world=world, controls=controls)
 
 
@@ -244,16 +244,23 @@ ROLLOUT = tuple(
 )
 
 
-def _options(world: World, state: State, inputs: tuple, steps: int) -> int:
-    """Which of OPTIONS: for one world those that compile sooner; quickest where few steps, or small ones, are to run.
+def options_for(inputs: tuple, steps: int, worlds: int) -> int:
+    """Which of OPTIONS: those that compile sooner where few steps, or small ones, are to run, of one world or a few.
 
-    A batch, or a crowd, would not run as fast, nor a GPU. What is differentiated may not have its own: reverse mode
-    makes a part of another program of it.
+    A crowd would not run as fast, nor a GPU. What is differentiated may not have its own: reverse mode makes a part of
+    another program of it.
+
+    Args:
+        inputs: of the program, a world first.
     """
-    alone = state.x.ndim == 2 and not world.crowd and jax.default_backend() == "cpu"
-    if not alone or traced(inputs) or not is_own_program():
-        return 2
-    return int(steps * work(world) > MUCH)
+    world = inputs[0]
+    if world.crowd or is_for_speed() or jax.default_backend() != "cpu" or traced(inputs) or not is_own_program():
+        return OPTIONS.index(None)
+    return (worlds > 1) + (steps * worlds * work(world) > MUCH)
+
+
+def _worlds(state: State) -> int:
+    return int(np.prod(state.x.shape[2:]))
 
 
 def work(world: World) -> int:

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.compiling import LASTING, QUICK, is_own_program
-from diffrigid.step import OPTIONS, _options
+from diffrigid.step import OPTIONS, options_for
 
 SCRIPT = """
 import json
@@ -25,17 +25,24 @@ dr.compile_for_speed()
 dr.compile_for_speed()  # once more changes nothing
 assert is_for_speed()  # then batches run in smaller chunks
 jax.config.update("jax_enable_x64", True)
-from test_compiling import bounces
+from test_compiling import bounces, falling
+from diffrigid.step import OPTIONS, options_for
 
+assert OPTIONS[options_for(falling(), 1, 1)] is None  # what is called as it comes is not compiled to compile sooner
 print(json.dumps(bounces()))
 """
 
 
-def bounces():
-    """How many loops XLA has left in the program of a rollout, and where a spinning disc ends that falls on a floor."""
+def falling():
+    """A spinning disc over a floor."""
     disc = dr.Body(dr.Disc(radius=0.2), mass=1.0, x=(0.0, 1.0), v=(1.0, 0.0), w=3.0)
     bodies = {"disc": disc, "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))}
-    world, state = dr.scene(bodies, gravity=(0.0, -9.81), restitution=0.8, friction=0.3)
+    return dr.scene(bodies, gravity=(0.0, -9.81), restitution=0.8, friction=0.3)
+
+
+def bounces():
+    """How many loops XLA has left in the program of a rollout, and where a spinning disc ends that falls on a floor."""
+    world, state = falling()
     program = jax.jit(lambda *start: dr.rollout(*start, dt=1 / 60, steps=60).state.x[-1]).lower(world, state).compile()
     return {"loops": program.as_text().partition("ENTRY")[2].count(" while("), "x": program(world, state).tolist()}
 
@@ -89,18 +96,17 @@ def test_quick_changes_the_time_to_compile_and_nothing_else():
 def test_what_runs_for_long_is_compiled_for_longer():
     """A disc in free fall runs for a million steps in a second; ten boxes that may pile up for ten thousand in ten."""
 
-    def options(shape, count, steps):
+    def options(shape, count, steps, worlds=1):
         bodies = {f"{i}": dr.Body(shape, mass=1.0, x=(0.0, 3.0 * i)) for i in range(count)}
-        world, state = dr.scene(bodies, gravity=(0.0, -9.81))
-        return OPTIONS[_options(world, state, (), steps)]
+        return OPTIONS[options_for(dr.scene(bodies, gravity=(0.0, -9.81)), steps, worlds)]
 
     disc, box = dr.Disc(radius=0.2), dr.Box(half=(0.5, 0.5))
     assert options(disc, 1, 100_000) is QUICK
     assert [options(box, 10, steps) for steps in (1000, 10_000)] == [QUICK, LASTING]
+    assert [options(box, 10, 10, worlds) for worlds in (100, 1000)] == [LASTING, None]
 
     def traced(x):
-        world, state = dr.scene({"disc": dr.Body(disc, mass=1.0, x=(0.0, 1.0))})
-        assert OPTIONS[_options(world, state, (), 1)] is None  # JAX would refuse it options of its own
+        assert options(disc, 1, 1) is None  # JAX would refuse it options of its own
         return x
 
     jax.jit(traced)(1.0)
