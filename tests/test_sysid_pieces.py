@@ -7,6 +7,7 @@ from test_sysid_exact import FREE, GRAVITY, NOISE, point
 
 import diffrigid as dr
 from diffrigid import sysid
+from diffrigid.sysid.covariance import Linear
 
 TRUTH, COARSE = {"restitution": 0.95, "ball.v": (3.0, 0.7)}, 2e-3  # [m]
 
@@ -59,3 +60,18 @@ def test_what_is_not_measured_has_no_pieces():
     data = {"t": np.arange(9) / 8, "a.x": np.zeros((9, 2))}
     with pytest.raises(ValueError, match="no column 'b.x'"):
         sysid.fit_in_pieces(world, state, data, 3, free={"a.mass": dr.positive()})
+
+
+@pytest.mark.parametrize("intervals", [sysid.sandwich, sysid.bootstrap])
+def test_what_one_record_alone_tells_is_not_taken_for_certain(intervals):
+    """Of seven records one tells the second number, in the other six its slopes are rounding: as from that record."""
+    random, shares = np.random.default_rng(3), []
+    for _ in range(20):
+        slopes = [np.stack([np.ones(200), random.normal(size=200) * (1.0 if k == 0 else 1e-40)], 1) for k in range(7)]
+        rows = [random.normal(size=200) for _ in slopes]
+        best = np.linalg.lstsq(np.concatenate(slopes), np.concatenate(rows), rcond=None)[0]
+        rows, times = [r - s @ best for r, s in zip(rows, slopes, strict=True)], [np.arange(200) / 60.0] * 7
+        linear = Linear(tuple(rows), tuple(slopes), tuple(times), shared=2, variance=1.0, estimated=False)
+        shares.append(np.diag(intervals(linear).covariance) / np.diag(sysid.from_jacobian(linear).covariance))
+    # Twenty pieces tell the second number, so that each share scatters by a third, and their mean by 7 %.
+    assert_allclose(np.mean(shares, 0), 1.0, atol=0.25)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 BLOCKS = 20  # pieces of time that stand for independent runs where there is only one record
+LEFT = 0.01  # of the information in some direction; if all clusters but one have less of it, they do not tell it
 DRAWS = 2000  # of the bootstrap
 MANY = 1e6  # degrees of freedom: Student's distribution is the normal one
 
@@ -57,7 +58,9 @@ def sandwich(linear: Linear) -> Uncertainty:
     """From how far each record pulls: right where the model is wrong, or residuals go together within a record.
 
     Leaves out each record in turn, to first order; with one record, each of 20 pieces of its time, which is right if
-    residuals of different pieces are independent. Source: jackknife of clusters, CR3 of Bell and McCaffrey 2002.
+    residuals of different pieces are independent; likewise where one record tells nearly all of some number. What a
+    single piece tells has the variance of `from_jacobian`. Source: jackknife of clusters, CR3 of Bell and McCaffrey
+    2002.
 
     Example:
         >>> careful = found.with_intervals(dr.sandwich)["restitution"]  # of one record: by pieces of its time
@@ -65,10 +68,13 @@ def sandwich(linear: Linear) -> Uncertainty:
         True
     """
     H, pull = _clusters(linear)
-    total, count = sum(H), len(H)
-    moved = np.stack([inverse(total - h) @ p for h, p in zip(H, pull, strict=True)])
+    count, root = len(H), _root(np.sum(H, axis=0))
+    moved = np.stack(
+        [root @ _inverted(np.eye(root.shape[1]) - root.T @ h @ root) @ root.T @ p for h, p in zip(H, pull, strict=True)]
+    )
     moved = moved - moved.mean(0)
-    return Uncertainty((count - 1) / count * moved.T @ moved, float(count - 1))
+    covariance = (count - 1) / count * moved.T @ moved
+    return Uncertainty(covariance + linear.variance * _told_by_one(H, root), float(count - 1))
 
 
 def bootstrap(linear: Linear) -> Uncertainty:
@@ -80,11 +86,13 @@ def bootstrap(linear: Linear) -> Uncertainty:
         True
     """
     H, pull = _clusters(linear)
-    count = len(H)
+    count, root = len(H), _root(np.sum(H, axis=0))
     times = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=DRAWS).astype(float)
-    matrices, pulls = np.einsum("dk,kab->dab", times, np.stack(H)), np.einsum("dk,ka->da", times, np.stack(pull))
-    moved = np.stack([inverse(h) @ p for h, p in zip(matrices, pulls, strict=True)])
-    return Uncertainty(np.atleast_2d(np.cov(moved.T)) * count / max(count - 1, 1), float(count - 1))
+    shares, pulls = (np.stack(part) for part in ([root.T @ h @ root for h in H], [root.T @ p for p in pull]))
+    matrices, pulls = np.einsum("dk,kab->dab", times, shares), np.einsum("dk,ka->da", times, pulls)
+    moved = np.stack([root @ _inverted(h) @ p for h, p in zip(matrices, pulls, strict=True)])
+    covariance = np.atleast_2d(np.cov(moved.T)) * count / max(count - 1, 1)
+    return Uncertainty(covariance + linear.variance * _told_by_one(H, root), float(count - 1))
 
 
 def own_covariance(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
@@ -99,6 +107,31 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
     """Inverse of a symmetric matrix >= 0, scaled first so that units do not matter; pseudo-inverse where singular."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     return np.linalg.pinv(matrix / scale / scale[:, None], rcond=1e-13, hermitian=True) / scale / scale[:, None]
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """R (a, rank) with R R^T the `inverse` of a matrix."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    sizes, vectors = np.linalg.eigh(matrix / scale / scale[:, None])
+    seen = sizes > 1e-13 * max(sizes[-1], 1e-300)
+    return vectors[:, seen] / np.sqrt(sizes[seen]) / scale[:, None]
+
+
+def _inverted(share: np.ndarray) -> np.ndarray:
+    """Inverse of a share of all information, which is 1 in every direction; 0 in those in which hardly any is left."""
+    sizes, vectors = np.linalg.eigh(share)
+    left = sizes > LEFT
+    return vectors[:, left] / sizes[left] @ vectors[:, left].T
+
+
+def _told_by_one(H: list[np.ndarray], root: np.ndarray) -> np.ndarray:
+    """The part of the inverse of all information in directions of which one cluster has nearly all."""
+    out = np.zeros((len(root), len(root)))
+    for h in H:
+        shares, vectors = np.linalg.eigh(root.T @ h @ root)
+        alone = root @ vectors[:, shares >= 1.0 - LEFT]
+        out += alone @ alone.T
+    return out
 
 
 def student_quantile(freedom: float, probability: float = 0.975) -> float:
@@ -120,14 +153,18 @@ def _blocks(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def _clusters(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """As `_blocks`, for pieces of time if there is one record; at least two clusters."""
-    if len(linear.rows) > 1:
-        return _blocks(linear)
-    J, r = eliminated(linear, 0)
-    t = linear.times[0]
-    order = np.argsort(np.where(np.isfinite(t), t, np.nanmin(t)), kind="stable")
-    pieces = np.array_split(order, min(BLOCKS, max(len(order) // 4, 2)))
-    return [J[p].T @ J[p] for p in pieces], [-J[p].T @ r[p] for p in pieces]
+    """As `_blocks`; for pieces of time if there is one record, or one that tells nearly all of something."""
+    H, pull = _blocks(linear)
+    if len(H) > 1 and not _told_by_one(H, _root(np.sum(H, axis=0))).any():
+        return H, pull
+    H, pull = [], []
+    for k, t in enumerate(linear.times):
+        J, r = eliminated(linear, k)
+        order = np.argsort(np.where(np.isfinite(t), t, np.nanmin(t)), kind="stable")
+        pieces = np.array_split(order, min(BLOCKS, max(len(order) // 4, 2)))
+        H += [J[p].T @ J[p] for p in pieces]
+        pull += [-J[p].T @ r[p] for p in pieces]
+    return H, pull
 
 
 def eliminated(linear: Linear, record: int) -> tuple[np.ndarray, np.ndarray]:
