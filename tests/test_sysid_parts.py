@@ -17,7 +17,7 @@ from diffrigid.__main__ import main
 from diffrigid.impacts import order_of_impacts
 from diffrigid.scene_file import read_scene
 from diffrigid.step import steps_in
-from diffrigid.sysid.diagnosis import Blind, doubts, normality, whiteness
+from diffrigid.sysid.diagnosis import Blind, coordinates, doubts, normality, whiteness
 from diffrigid.sysid.levenberg import Numbers, Point, minimise
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import in_words
@@ -532,6 +532,15 @@ def test_what_is_seen_of_an_inertia_has_an_interval():
     sizes = np.array([3.0, 1.0])  # second moments along axes 1 and 3: their sum is the inertia about axis 2
     assert_allclose(wide[1, 1], 2 * 2.0 * 1e-2 * np.sqrt((sizes**2).sum()), rtol=1e-6)
     assert_allclose(wide[0, 1], 0.0, atol=1e-12)
+
+
+def test_numbers_have_the_names_of_the_table():
+    """Of a matrix by row and column; of a chart, which has fewer numbers than the value, one by one."""
+    corners = Slot("tile.shape.vertices", ("tile.shape.vertices",), dr.real(), 6)
+    inertia = Slot("die.inertia", ("die.inertia",), dr.inertia(principal=True), 3)
+    names = [place.name for place in coordinates([corners, inertia], [np.ones((3, 2)), np.eye(3)])]
+    assert names[4:6] == ["tile.shape.vertices[2, 0]", "tile.shape.vertices[2, 1]"]
+    assert names[6:] == [f"die.inertia[{k}]" for k in range(3)]
 
 
 def test_only_numbers_without_an_interval_are_said_not_to_be_determined():

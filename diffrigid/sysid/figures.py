@@ -7,8 +7,7 @@ import numpy as np
 from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import Profile
-from diffrigid.sysid.result import Fit
-from diffrigid.sysid.table import number_names
+from diffrigid.sysid.result import Fit, number_names
 
 
 def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:
@@ -50,7 +49,7 @@ def cost_figure(fit: Fit) -> Any:
 def correlation_figure(fit: Fit) -> Any:
     """Correlations of the shared numbers."""
     figure, axes = _axes(5.0, 4.2)
-    names = number_names(fit.problem.shared)
+    names = number_names(fit.problem)
     image = axes.imshow(correlations(fit.covariance), vmin=-1, vmax=1, cmap="RdBu")
     axes.set_xticks(range(len(names)), names, rotation=90)
     axes.set_yticks(range(len(names)), names)

@@ -243,6 +243,11 @@ def references(problem: Problem) -> list[np.ndarray]:
     return [np.asarray(reference(slot, scene_having(problem, slot))) for slot in (*problem.shared, *problem.own)]
 
 
+def number_names(problem: Problem) -> list[str]:
+    """Names of the shared numbers of z, in order."""
+    return [place.name for place in coordinates(problem.shared, references(problem)[: len(problem.shared)])]
+
+
 def pieces(slots: tuple[Slot, ...], first: int = 0) -> list[tuple[Slot, slice]]:
     """The numbers of z of each parameter, from `first` on."""
     ends = np.cumsum([first, *(slot.size for slot in slots)])

@@ -1,7 +1,6 @@
 """The table of a fit, as text and as HTML."""
 
 import html
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -35,11 +34,6 @@ def rows_of(p: Any) -> list[tuple[str, ...]]:
     if p.records > SHOWN:
         out.append((p.name, "...", "", "", f"and {p.records - SHOWN} more records"))
     return out
-
-
-def number_names(slots: Sequence) -> list[str]:
-    """Names of the numbers of z of some parameters, in order."""
-    return [slot.name if slot.size == 1 else f"{slot.name}[{k}]" for slot in slots for k in range(slot.size)]
 
 
 def below(fit: Any) -> list[str]:

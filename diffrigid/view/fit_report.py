@@ -10,8 +10,9 @@ from diffrigid.impacts import contacts
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import Profile, profile, with_profiles
 from diffrigid.sysid.records import Series
+from diffrigid.sysid.result import number_names
 from diffrigid.sysid.sensors import Part
-from diffrigid.sysid.table import HEADER, SHOWN, below, number_names, rows
+from diffrigid.sysid.table import HEADER, SHOWN, below, rows
 from diffrigid.trajectory import Trajectory
 from diffrigid.view.play import Player, play
 from diffrigid.view.report import Section, chart, matrix, write_report
@@ -125,7 +126,7 @@ def _by_record(fit: Any) -> str:
 
 
 def _search(fit: Any, found: Sequence[Profile]) -> Section:
-    names = number_names(fit.problem.shared)
+    names = number_names(fit.problem)
     charts = [_costs(fit)] if len(fit.costs) > 1 else []
     if len(names) > 1:
         label = [f"{name}  {k + 1}" for k, name in enumerate(names)]
