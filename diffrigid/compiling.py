@@ -14,8 +14,10 @@ from jax import lax
 # Without LLVM's optimisation one world runs a fifth to three times slower, and a batch, of which nothing is vectorised
 # then, five times. Its higher levels take longer to compile than the first and are no faster.
 UNFUSED = {"xla_cpu_use_fusion_emitters": False}  # with them a batch runs faster, and compiles twice as long
-QUICK = UNFUSED | {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
-LASTING = UNFUSED | {"xla_backend_optimization_level": 1}  # for what runs for longer than it compiles
+LEVEL = "xla_backend_optimization_level"
+QUICK = UNFUSED | {LEVEL: 0, "xla_cpu_parallel_codegen_split_count": 1}
+# For what runs for longer than it compiles; where XLA_FLAGS sets a level, as in the tests, that holds.
+LASTING = UNFUSED | ({} if LEVEL in os.environ.get("XLA_FLAGS", "") else {LEVEL: 1})
 # A loop whose step accesses fewer bytes is one function; short loops over the worlds are not written out one by one
 # before they are vectorised, as LLVM else does up to some hundred; and vectors are as wide as there are.
 SPEED = (
