@@ -36,7 +36,7 @@ def _eliminated(matrix: Array, right: Array) -> Array:
     if len(matrix) <= TINY:
         return _written_out(system)
     if len(matrix) <= SMALL:
-        return _gauss_jordan(system)
+        return _gauss(system)
     # By itself, for else all that the matrix is made of is computed in the order of the transposed one.
     system = unfused(opaque_true(right), lambda system: system, system)
     # What elimination makes of the right side beside the matrix needs no permutation.
@@ -74,11 +74,12 @@ def _written_out(system: Array) -> Array:
     return jnp.stack(x)
 
 
-def _gauss_jordan(system: Array) -> Array:
+def _gauss(system: Array) -> Array:
     """x of a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch).
 
     Pivots are chosen by column in each matrix of the batch; rows stay where they are. A direction whose pivot is 0 is
-    left out.
+    left out. Rows that had their turn are not touched again: cleared too (Gauss-Jordan) they leave residuals as large
+    as the matrix is badly conditioned.
     """
     count = system.shape[0]
     index = lax.broadcasted_iota(np.int32, (count, *system.shape[2:]), 0)
@@ -86,13 +87,22 @@ def _gauss_jordan(system: Array) -> Array:
     def eliminate(k, carry):
         system, order = carry
         column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
-        best = jnp.argmax(jnp.where(order < count, -1.0, jnp.abs(column)), 0)
+        waits = order == count
+        best = jnp.argmax(jnp.where(waits, jnp.abs(column), -1.0), 0)
         chosen = index == best.astype(np.int32)[None]
         row = jnp.where(chosen[:, None], system, 0.0).sum(0)
         pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
         row = row * safe_divide(jnp.ones_like(pivot), pivot)[None]
-        system = jnp.where(chosen[:, None], row[None], system - column[:, None] * row[None])
+        below = jnp.where(waits, column, 0.0)
+        system = jnp.where(chosen[:, None], row[None], system - below[:, None] * row[None])
         return system, jnp.where(chosen, k, order)
 
     system, order = lax.fori_loop(0, count, eliminate, (system, jnp.full_like(index, count)))
-    return jnp.where(order[None] == index[:, None], system[None, :, count], 0.0).sum(1)
+
+    def substitute(step, x):
+        k = count - 1 - step
+        row = jnp.where((order == k)[:, None], system, 0.0).sum(0)
+        known = jnp.where(index > k, row[:count] * x, 0.0).sum(0)
+        return jnp.where(index == k, (row[count] - known)[None], x)
+
+    return lax.fori_loop(0, count, substitute, jnp.zeros_like(system[:, 0]))
