@@ -72,9 +72,12 @@ class Found(NamedTuple):
 def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Found:
     clear, no = clearance(task), start < start
 
+    def safe(s, dt):  # the step is over long before anything closes
+        return dt >= 2.0 * (task.t1 - s)
+
     def flying(carry):
         count, s, dt, _ = carry
-        return ~at_end & ((count == 0) | ((count < ADVANCES) & any_world((dt > 0) & (s < task.t1))))
+        return ~at_end & ((count == 0) | ((count < ADVANCES) & any_world((dt > 0) & (s < task.t1) & ~safe(s, dt))))
 
     def advance(carry):
         count, s, dt, rests = carry
@@ -84,7 +87,9 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
         return count + 1, s, clear(gaps, rests, s), rests
 
     first = (0, start, jnp.zeros_like(start), jnp.zeros((_count(task, start, live), *start.shape), bool))
-    _, near, _, rests = lax.while_loop(flying, advance, first)
+    _, near, dt, rests = lax.while_loop(flying, advance, first)
+    over = (near < task.t1) & safe(near, dt)
+    near = jnp.where(over, task.t1, near)
 
     def approach(near):
         def look(now):
@@ -97,10 +102,11 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
         return near, jnp.zeros_like(near), from_time(near).closest()
 
     near, level, nearest = if_smooth(task.width, approach, exact, near)
+    nothing = over & (level <= 0)
 
     def polishing(carry):
         count, _, look = carry
-        return ~at_end & ((count == 0) | ((count <= POLISH) & any_world(~look.converged(task))))
+        return ~at_end & (count <= POLISH) & any_world(jnp.where(count == 0, ~nothing, ~look.converged(task)))
 
     def along(carry):
         count, s, before = carry
@@ -108,7 +114,8 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
         return count + 1, s + look.dt, look._replace(inside=jnp.where(count == 0, look.inside, before.inside))
 
     _, s, look = lax.while_loop(polishing, along, (0, near, Polish(jnp.zeros_like(near), no, no, no)))
-    return Found(s, near, look.found(task), look.inside, rests, None if task.width is None else nearest)
+    found = look.found(task) & ~nothing
+    return Found(s, near, found, look.inside & ~nothing, rests, None if task.width is None else nearest)
 
 
 def _count(task: Task, start: Array, live: Array) -> int:

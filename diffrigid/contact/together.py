@@ -36,8 +36,8 @@ from diffrigid.numerics import FOUND, safe_divide
 ROUNDS = 90  # at most, of Newton's method
 CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
 ROUGH = 1e-2  # with this relative error, and then with as little as it can
-PILE = 4  # bodies; with fewer it is enough to go back to the best, and the other method need not be compiled
-SMOOTHING = 3  # rounds before the first Newton step, and after one that gained little
+PILE = 4  # bodies; with fewer the guess is near enough, it suffices to go back to the best, and less is compiled
+SMOOTHING = 3  # rounds before the first Newton step, in piles, and after one that gained little
 DOUBLES = 5  # Newton's rounds after which these are twice as many, where it does not get on
 SMOOTHEST = 384  # of them at most
 LITTLE = 0.9  # of the error before: a step that leaves more gained little
@@ -99,7 +99,7 @@ def _solutions(
 
     def solved(guess):
         at_guess = cone, v_rel - _yielded(cone, guess), arms, mobility
-        P = _smoothed(guess, SMOOTHING, *at_guess)
+        P = guess if len(mobility.inverse_mass) < PILE else _smoothed(guess, SMOOTHING, *at_guess)
         z, r = _missing(P, *at_guess)
         error = _speed(cone, r)
         no = error < 0
