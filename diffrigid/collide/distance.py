@@ -83,7 +83,7 @@ def hull_distance(shape: Hull, p: Array, inward: Array, slack: Array) -> tuple[A
     reachable = _reachable(height, facing, slack)
     closest, on_face = jax.vmap(_triangle, in_axes=(0, 0, 0, 0, 0, None, None))(a, b, c, outward, height, p, slack)
     square = jax.vmap(lambda r: dot(r, r))(p[None] - closest)
-    square = square + jnp.where(facing < -slack[None], slack * slack, 0.0)  # of two at an edge, not the side
+    square = square + jnp.where(facing < -slack[None], slack * slack, 0.0)  # at an edge, not the face from behind
     inside = reachable.max(0) <= 0
     best = jnp.where(inside, jnp.argmax(reachable, axis=0), jnp.argmin(square, axis=0))
     chosen = jax.nn.one_hot(best, height.shape[0], axis=0, dtype=p.dtype)
@@ -137,6 +137,6 @@ def core_distance(shape, p: Array, inward: Array, slack: Array) -> tuple[Array, 
 
 
 def reach(shape, dim: int) -> Array:
-    """Radius about the shape's origin that holds all of it, (*batch) [m]."""
+    """Radius about the shape's origin that encloses it, (*batch) [m]."""
     corners = vertices(shape, dim)
     return jax.vmap(norm)(corners).max(0) + radius(shape)

@@ -211,7 +211,7 @@ def _demanded(
 ) -> tuple[Strikes, Law, Array, Array]:
     """Contacts that take part in a pass, their law, for how long [s] they are held, and which contacts rest.
 
-    A contact whose turn it is is struck: its normal velocity becomes restitution times the closing speed, or 0 if it
+    A contact is struck when it is its turn: its normal velocity becomes restitution times the closing speed, or 0 if it
     comes to rest. A resting contact is held: it must not close, except by as much as its gap is open.
     """
     push, drives = phase == PUSH, flags(driven(world), dt[None])

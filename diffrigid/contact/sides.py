@@ -95,7 +95,7 @@ def centre(side: Side, s: Array) -> tuple[Array, Array]:
 
 
 def earliest(a: Side, b: Side) -> tuple[Array, Array]:
-    """Time from which both paths begin, and the earliest time at which a late impact may be repaired; (*batch) [s]."""
+    """Time from which both paths hold, and the earliest time at which a late impact may be repaired; (*batch) [s]."""
     start = began(a, b)
     if b.flight is None or a.flight is None:
         return start, (a if b.flight is None else b).since
@@ -103,7 +103,7 @@ def earliest(a: Side, b: Side) -> tuple[Array, Array]:
 
 
 def began(a: Side, b: Side) -> Array:
-    """Time from which both paths begin, (*batch) [s]."""
+    """Time from which both paths hold, (*batch) [s]: the later of their beginnings."""
     if b.flight is None or a.flight is None:
         return (a if b.flight is None else b).flight.t0
     return jnp.maximum(a.flight.t0, b.flight.t0)
