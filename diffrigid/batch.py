@@ -1,4 +1,4 @@
-"""Many worlds at once: the one place where the batch axis moves.
+"""Many worlds at once: the only place where the batch axis moves.
 
 Inside, the batch is the last axis, because on a CPU XLA vectorises the innermost one, and a batch runs in
 chunks whose temporaries stay in the cache, divided among the devices. Outside, the JAX convention holds: a leading
@@ -46,7 +46,7 @@ def rollout_batch(
     world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, controls: Any = None,
     chunk: int | None = None, memory: int = MEMORY,
 ) -> State:  # fmt: skip
-    """States of B worlds, from `world` and `state` of which any leaf may have a leading batch axis.
+    """States of B worlds, from `world` and `state`, any leaf of which may have a leading batch axis.
 
     Args:
         dt: [s].
@@ -90,7 +90,7 @@ def rollout_batch(
 
 
 def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -> Any:
-    """Controls of the whole batch, with the batch last: (T, D or A, B), or 1 where they are alike."""
+    """Controls of the whole batch, with the batch last: (T, D or A, B), or of length 1 where all worlds share them."""
     if isinstance(controls, Mapping):
         sizes = controlled(world.forces)
         controls = {k: _batch_last(k, v, (steps, sizes[k]), count) if k in sizes else v for k, v in controls.items()}
@@ -98,7 +98,7 @@ def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -
 
 
 def _batch_last(name: str, value: Any, own: tuple[int, int], count: int) -> Any:
-    """(B, T, D or A) to (T, D or A, B); what is alike for all stays."""
+    """Move the batch of a control last, (B, T, D or A) to (T, D or A, B); one that all worlds share stays."""
     array = numbers(f"controls[{name!r}]", value, None)
     if array.shape not in (own, (count, *own)):
         raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {own} or {(count, *own)}.")
@@ -106,7 +106,7 @@ def _batch_last(name: str, value: Any, own: tuple[int, int], count: int) -> Any:
 
 
 def _check_leaves(world: World, state: State) -> None:
-    """Raise ValueError for what is no world or state, and for a leaf that has more than a batch axis and its own."""
+    """Raise ValueError unless given a world and a state, each leaf with at most one axis beside its own."""
     check_kinds(world, state)
     sizes = axis_sizes(world)
 
@@ -129,7 +129,7 @@ def _batch_sizes(tree) -> list[int]:
 
 
 def _chunk(world: World) -> int:
-    """Power of two of worlds whose contacts and bodies fill LANES."""
+    """Number of worlds of a chunk, a power of two, whose contacts and bodies fill LANES."""
     fast = is_for_speed()
     corner, least, most = (CORNER_FOR_SPEED, LEAST_FOR_SPEED, MOST_FOR_SPEED) if fast else (CORNER, LEAST, MOST)
 
@@ -150,7 +150,7 @@ def _state_bytes(world: World, state: State) -> int:
 
 
 def _batch_axes(world: World, controls: Any, count: int) -> list[int | None]:
-    """Of each leaf of the controls the axis of the batch, or None."""
+    """For each leaf of the controls, its batch axis or None."""
     names, leaves = controlled(world.forces), jax.tree_util.tree_leaves_with_path(controls)
     keys = [getattr(path[0], "key", None) if path else None for path, _ in leaves]
     own = [key in names and leaf.shape[-1] == count for key, (_, leaf) in zip(keys, leaves, strict=True)]
