@@ -34,8 +34,8 @@ from diffrigid.step import (
 from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
 LANES = 2**15  # of a chunk: one for each contact, or more, and four for each body of its worlds
-# Lanes of a contact of shapes with corners: it is searched for, and is rarely alone; least and most worlds of a chunk.
-# Compiled for speed a small chunk costs no more calls, and what one world of it needs is computed for fewer.
+# Lanes of a contact of shapes with corners, which needs a search and is rarely alone; least and most worlds of a chunk.
+# Compiled for speed, small chunks cost no more calls, and what one world needs is computed for fewer others.
 CORNER, CORNER_FOR_SPEED = 32, 512
 LEAST, LEAST_FOR_SPEED = 2**5, 2**4
 MOST, MOST_FOR_SPEED = 2**12, 2**6
@@ -56,7 +56,7 @@ def rollout_batch(
             worlds, or (B, T, D or A).
         chunk: worlds that run together; default: as many as fit the cache and `memory`.
         memory: [bytes] that reverse mode may use for saved states on each device. If a batch needs more, only the start
-            of each chunk is kept and the chunk is computed again; if one chunk needs more, see `rollout`.
+            of each chunk is kept and the chunk is recomputed; if one chunk needs more, see `rollout`.
 
     All JAX devices share the work, those of other processes too: then every process makes the same call,
     and the result lies where it was computed (`jax.experimental.multihost_utils.process_allgather` brings it together).

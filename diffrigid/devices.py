@@ -31,7 +31,7 @@ def over_devices(fn: Callable, parts: Any, whole: Any) -> Any:
     """
     if len(devices()) == 1:
         return fn(parts, whole)
-    # Without the check of what varies from device to device, which does not know the loops and solves inside.
+    # Without the check of which values vary between devices: it does not support the loops and solves inside.
     specs = (SHARE, PartitionSpec())
     return jax.shard_map(fn, mesh=_mesh(), in_specs=specs, out_specs=SHARE, check_vma=False)(parts, whole)
 

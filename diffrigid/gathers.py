@@ -20,7 +20,7 @@ FEW, MANY = 12, 40  # terms up to which a sum is unrolled: where there are many 
 
 
 def rows(values: Array, index: tuple) -> Array:
-    """values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples."""
+    """Gather values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples."""
     first, flat = index[0], not isinstance(index[0], tuple)
     if flat and index == (first,) * len(index):
         return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))

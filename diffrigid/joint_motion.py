@@ -48,7 +48,7 @@ def write(world: Any, state: State, name: str, field: str, value: Array) -> Stat
 
 
 def moving_side(world: Any, name: str) -> tuple[int, tuple[int, ...]]:
-    """Which side of a joint moves when it is set, 0 for that of a, and its bodies, that of the joint first.
+    """Side of a joint that moves when it is set, 0 for that of a, and its bodies, that of the joint first.
 
     No bodies if both sides are connected without the joint, so that neither moves alone.
     """

@@ -1,4 +1,4 @@
-"""Which bodies overlap: the exact signed distance of two rounded convex shapes, in NumPy, for known scenes.
+"""Overlap of bodies: the exact signed distance of two rounded convex shapes, in NumPy, for known scenes.
 
 The distance of two convex cores is the largest separation along any direction, and the largest is found along
 one of finitely many: normals of faces, perpendiculars of two edges or of an edge and a vertex, lines through

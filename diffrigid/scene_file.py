@@ -81,7 +81,7 @@ class SceneFile:
 
 
 def read_scene(path: str | Path) -> SceneFile:
-    """Read the scene of a file, and what is to be fitted in it.
+    """Read the scene of a file, and the free parameters of it.
 
     Raises:
         ValueError: names the file, the table and the key, what was expected, and the nearest name.

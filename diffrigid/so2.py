@@ -44,12 +44,12 @@ def exp(phi: Array) -> Array:
 
 
 def turn_by(phi: Array, q: Array) -> Array:
-    """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
+    """Turn q by the rotation vector phi in world axes, (A, *batch) [rad]."""
     return _unit_product(q, cos_sin(phi[0]))
 
 
 def turn_in_body(q: Array, phi: Array) -> Array:
-    """q turned further by the rotation vector phi in body axes: the same in the plane."""
+    """Turn q by the rotation vector phi in body axes: the same as `turn_by` in the plane."""
     return _unit_product(q, cos_sin(phi[0]))
 
 

@@ -70,13 +70,13 @@ def exp(phi: Array) -> Array:
 
 @whole(so3_whole.turn_by, 1, 1)
 def turn_by(phi: Array, q: Array) -> Array:
-    """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
+    """Turn q by the rotation vector phi in world axes, (A, *batch) [rad]."""
     return _unit_product(_exp(phi), q)
 
 
 @whole(so3_whole.turn_in_body, 1, 1)
 def turn_in_body(q: Array, phi: Array) -> Array:
-    """q turned further by the rotation vector phi in body axes, (A, *batch) [rad]."""
+    """Turn q by the rotation vector phi in body axes, (A, *batch) [rad]."""
     return _unit_product(q, _exp(phi))
 
 
@@ -340,7 +340,7 @@ def rate(w: Array, q: Array) -> Array:
 
 @whole(so3_whole.difference, 1, 1)
 def difference(q: Array, p: Array) -> Array:
-    """Orientation p in the axes of q, q^-1 o p: turned by q after it, the result is p."""
+    """Orientation p in the axes of q, q^-1 o p."""
     s, x, y, z = q
     return _unit_product([s, -x, -y, -z], p)
 

@@ -197,7 +197,7 @@ def steps_in(gaps: np.ndarray, longest: Any) -> np.ndarray:
 
 
 def advance(world: World, state: State, dt: Array, controls: Any) -> State:
-    """One step on arrays with aligned batch axes; dt (*batch)."""
+    """Advance by one step, on arrays with aligned batch axes; dt (*batch)."""
 
     def launch_from(state: State, t0: Array) -> Flight:
         return launch(world, state, controls, t0, dt)

@@ -1,13 +1,13 @@
 """Signed distance from the core of a convex shape to a corner of another body, in the shape's own axes.
 
-Each function takes a shape, a point p (D, *batch) [m], and what it is a corner of: `inward` (D, *batch) [m],
-from p to the middle of its body. It returns `(distance, normal)`: (*batch) [m], negative inside, and the unit
-vector from the shape to the point, (D, *batch). On a face the distance is that to its plane and the normal is
-constant: both are smooth through zero. Beyond a corner or an edge it is Euclidean, |p - closest|.
+Each function takes a shape, a point p (D, *batch) [m], which is a corner of another body, and `inward`
+(D, *batch) [m], from p to the middle of that body. It returns `(distance, normal)`: (*batch) [m], negative inside,
+and the unit vector from the shape to the point, (D, *batch). On a face the distance is that to its plane and the
+normal is constant: both are smooth through zero. Beyond a corner or an edge it is Euclidean, |p - closest|.
 
 Where p is at two faces at once, `inward` decides which counts: a body that lies on a face is all in front of
 it. So corner on corner, as in a stack of equal boxes, the normal is that of the face between the two bodies
-and not rounding. `slack` (*batch) [m] is how near counts as at a face, an edge or a corner.
+and not one of rounding. `slack` (*batch) [m] is the distance within which p is at a face, an edge or a corner.
 """
 
 import jax

@@ -34,7 +34,7 @@ from diffrigid.state import rotations
 
 TOUCHES = 4  # contacts of a corner at most: a pit has three faces or more
 PEAKS = 4  # nodes at most that touch a body
-SAME = 1e-6  # [-] 1 - cosine: faces less apart than 1.4 mrad are one plane
+SAME = 1e-6  # [-] 1 - cosine: faces whose normals differ by less than 1.4 mrad are one plane
 SIGHT = 0.5  # [cells] that are looked up beyond the reach of a body, at least
 
 
@@ -185,10 +185,10 @@ def _faces(around: Around, slack: Array, alert: Array, rounding: Array) -> Conta
     away = (side[None] * foot).sum(1)
     distance = norm(away)
     inside = (below & (height < 0)).any(0)
-    # In the crease of a valley it may be over none: then it is over what is straight above.
+    # In the crease of a valley it may be over none: then it counts as over the faces straight above it.
     over = over | (below & ~over.any(0)[None] & inside[None])
     best = jnp.where(over & (height < 0), height, -jnp.inf).max(0)
-    # `slack`: what is computed twice may be rounded differently.
+    # `slack`: values that are computed twice may be rounded differently.
     touches = over & ((height >= -slack[None]) | (inside[None] & (height >= (best - slack)[None])))
     gap = jnp.where(height > slack[None], jnp.maximum(distance - rounding[None], alert[None]), FAR)
     gap = jnp.where(touches, height - rounding[None], gap)

@@ -113,7 +113,7 @@ def _corner_contacts(b: Profile, p: Array, rounding: Array, slack: Array, alert:
     before, after = _beyond(share, length)
     over = jnp.maximum(before, after) <= slack[None]
     best = jnp.where(over & (height < 0), height, -jnp.inf).max(0)  # inside, the least deep
-    # `slack`: what is computed twice may be rounded differently.
+    # `slack`: values that are computed twice may be rounded differently.
     touches = over & ((height >= -slack[None]) | (_inside(b, p)[None] & (height >= (best - slack)[None])))
     touches = touches | (
         _over_valley(along, over, before - slack[None], after - slack[None]) & (height >= -slack[None])

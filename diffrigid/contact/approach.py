@@ -34,7 +34,7 @@ class Task(NamedTuple):
 
     @property
     def span(self) -> Array:
-        """(*batch) [s]"""
+        """Length of the interval searched, (*batch) [s]."""
         return self.t1 - self.start
 
     @property
@@ -50,7 +50,7 @@ def task_of(a: Side, b: Side, t1: Array, width: Array | None, slow: Array) -> Ta
 
 
 def if_smooth(width: Array | None, smooth, exact, *args: Array) -> Any:
-    """smooth(*args) if any width is positive, else exact(*args)."""
+    """Evaluate smooth(*args) if any width is positive, else exact(*args)."""
     return exact(*args) if width is None else lax.cond(any_world(width > 0), smooth, exact, *args)
 
 
@@ -116,7 +116,7 @@ class Polish(NamedTuple):
     inside: Array  # (*batch) bool: some contact is within its level, and closing
 
     def converged(self, task: Task) -> Array:
-        """(*batch) bool"""
+        """Whether the step is within the tolerance in time, (*batch) bool."""
         return jnp.abs(self.dt) <= task.slack * task.span
 
     def found(self, task: Task) -> Array:

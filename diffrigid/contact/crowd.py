@@ -201,7 +201,7 @@ def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Encount
         s, _, found, u = approach(bodies, b, None)
         closes = u > jnp.maximum(ROUNDING * eps * speeds, SLOW * rest_speed)
         s = jnp.where(there & found & (s <= dt) & closes, jnp.floor(s / tie), jnp.inf)
-        # At the same time the fastest first, then the lower number: alike for both sides, so that some pair agrees.
+        # At equal times the fastest first, then the lower index: alike for both sides, so that some pair agrees.
         before = (u > fastest) | ((u == fastest) & (number < other))
         better = (s < first) | ((s == first) & (s < jnp.inf) & before)
         return tuple(jnp.where(better, new, old) for new, old in zip((s, u, number), best, strict=True))

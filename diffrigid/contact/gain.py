@@ -70,7 +70,7 @@ def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms
         return P0 + kappa[:, None] * both[1], None
 
     def between(P: Array, P0: Array) -> Array:
-        """From zero to P0, which adds energy only where there is no solution, and from there towards P."""
+        """Impulses from zero to P0, which adds energy only where there is no solution, and from there towards P."""
         goals = jnp.stack([P0, P]), jnp.array([1.0, 0.0], P.dtype)
         return lax.scan(towards, jnp.zeros_like(P), goals)[0]
 

@@ -1,4 +1,4 @@
-"""When two colliders meet within a step, on their true paths, and where.
+"""Time and place at which two colliders meet within a step, on their true paths.
 
 The time is found without derivatives, by a closed form for round shapes and a search for the rest, and then
 given the derivative of the implicit function theorem (`implicit_root`). Everything else, normal, arms and

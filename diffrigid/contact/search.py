@@ -1,4 +1,4 @@
-"""When any two shapes meet: conservative advancement towards the first contact, then the parabola of its gap.
+"""Time at which any two shapes meet: conservative advancement to the first contact, then the parabola of its gap.
 
 The search has no derivatives; `impact.py` gives the time it finds that of the implicit function theorem. A pair of a
 world goes through three stages, each with several evaluations ("looks") of its gaps:

@@ -55,7 +55,7 @@ def sides_of(world: Any, pairs: PairGroup, flight: Flight, since: Array) -> tupl
 
 
 def side_of(world: Any, flight: Flight, since: Array, kind: int, shape_rows: tuple, colliders: tuple) -> Side:
-    """Shapes `shape_rows` of world.shapes[kind], on colliders that all move or all stand still."""
+    """Side with shapes `shape_rows` of world.shapes[kind], on colliders that all move or are all static."""
     moving = flight.t0.shape[0]
 
     def chosen(tree, index):

@@ -42,13 +42,13 @@ DOUBLES = 5  # Newton rounds after which the smoothing rounds are doubled, where
 SMOOTHEST = 384  # smoothing rounds, at most
 LITTLE = 0.9  # [-] of the error before: a step that leaves more gained little
 PATIENCE = 3  # rounds without halving the error: then a small one is rounding, and else the best is smoothed
-# e: in double precision what leaves e^2 below rounding, in single precision what its own inverse allows.
+# e: in double precision such that e^2 is below rounding, in single precision as small as its inverse allows.
 COMPLIANCE, ROUNDINGS = 1.5e-8, 100.0
 REFINEMENTS = 4  # iterative ones, of the linear system of the derivative
 
 
 def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
-    """z, but for its term e rest, (C, D, *batch) [N s]."""
+    """z without its term e rest, (C, D, *batch) [N s]."""
     y = v_rel + moved(P, arms, mobility)
     return (1.0 - _compliance(P)) * P - (y - cone.target[:, None] * cone.normal) / cone.scale[:, None]
 

@@ -32,7 +32,7 @@ def from_quaternion(q: np.ndarray) -> np.ndarray:
 
 
 def to_quaternion(R: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) with w >= 0: the eigenvector of Bar-Itzhack's matrix (2000), good for any rotation."""
+    """Quaternion (w, x, y, z), w >= 0: the eigenvector of Bar-Itzhack's matrix (2000), good for any rotation."""
     (a, b, c), (d, e, f), (g, h, i) = R
     K = np.array(
         [

@@ -30,7 +30,7 @@ class Launch:
 
     world: World
     state: State
-    values: dict[str, np.ndarray]  # of what was varied
+    values: dict[str, np.ndarray]  # of the varied parameters, by name
     parameters: tuple[Parameter, ...]  # at their present values, with the interval to expect
     score: float  # mean logarithm of the standard deviations of z; -1 is intervals e times as narrow
 

@@ -43,7 +43,7 @@ def coordinates(slots: Sequence, references: Sequence[np.ndarray]) -> list[Coord
     for slot, reference in zip(slots, references, strict=True):
         log = isinstance(slot.kind, Free) and slot.kind.low == 0 and not np.isfinite(slot.kind.high)
         sizes = slot.kind.scale(reference)
-        shape = np.shape(reference) if np.size(reference) == slot.size else (slot.size,)  # of what has charts: z's own
+        shape = np.shape(reference) if np.size(reference) == slot.size else (slot.size,)  # of charts: that of z
         for k, index in enumerate(np.ndindex(shape)):
             name = slot.name if slot.size == 1 else f"{slot.name}[{', '.join(map(str, index))}]"
             out.append(Coordinate(name, slot.name, log, float(sizes[k])))

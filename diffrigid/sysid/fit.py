@@ -113,7 +113,7 @@ def fit(
     estimate, early = bool(problem.noise), ""
     point: Any = None
     for number, (width, window) in enumerate(stages):
-        # Twice if noise is estimated: with the guess, then with what the residuals say.
+        # Twice if noise is estimated: with the guess, then with the estimate from the residuals.
         for again in range(2 if estimate and number == len(stages) - 1 else 1):
             noise_now = estimated_noise(problem, point, loss) if again else problem.noise
             problem = with_noise(problem, noise_now, window, width)

@@ -9,7 +9,7 @@ A kind of parameter is a frozen record with the verbs
     at_bound(value)           true if a result lies on a bound
     log_volume(z, reference)  log |d value / d z|: volume of the parameter per volume of z
     check(where, value)       raises ValueError for a start that the kind does not allow
-    scale(reference)          (k,) a large change of z, by which what the data cannot tell is measured
+    scale(reference)          (k,) a large change of z: the measure of how well the data determine it
 
 `each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds prior knowledge.
 """

@@ -30,7 +30,7 @@ UNFINISHED = "not converged after {} iterations: raise iterations, or start else
 
 
 class Numbers(NamedTuple):
-    """z of S starts."""
+    """Unbounded numbers z of S starts."""
 
     shared: Array  # (a, S)
     own: Array  # (b, R, S)

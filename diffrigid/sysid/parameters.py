@@ -20,7 +20,7 @@ from diffrigid.world import World
 
 
 class Scene(NamedTuple):
-    """All that parameters are part of."""
+    """World, state and columns: all that parameters are part of."""
 
     world: World
     state: State

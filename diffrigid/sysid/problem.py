@@ -3,8 +3,8 @@
     z -> parameters -> scene of every record -> states -> what each column reads -> weighted residuals
 
 Records of one structure are one group: they are padded to one length and lie, like the starts and the directions of the
-Jacobian, side by side on the last axis, so that what is compiled does not grow with their number. All measured numbers
-are arguments of what is compiled: another record of the same shape costs no compilation.
+Jacobian, side by side on the last axis, so that the program does not grow with their number. All measured numbers are
+arguments of the program: another record of the same shape costs no compilation.
 """
 
 from collections.abc import Callable, Sequence

@@ -109,7 +109,7 @@ class Fit:
 
     @property
     def t(self) -> np.ndarray:
-        """(T+1,) [s] times of the first record, from its start on."""
+        """Times (T+1,) [s] of the first record, from its start on."""
         return all_times(self.problem.runs[0])
 
     @property
@@ -301,7 +301,7 @@ def interval_of(
     if isinstance(slot.kind, Free):
         deviation = np.where(np.abs(unseen).max(0, initial=0.0) > UNSEEN, np.inf, np.sqrt(np.diag(covariance)))
         ends = (z, z - quantile * deviation, z + quantile * deviation)
-        with np.errstate(over="ignore"):  # of what is hardly seen
+        with np.errstate(over="ignore"):  # of numbers that are hardly determined
             value, low, high = (np.asarray(slot.kind.value(end, about), float) for end in ends)
         return value, low, high
     centre = jnp.asarray(z, jnp.result_type(about))

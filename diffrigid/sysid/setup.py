@@ -41,7 +41,7 @@ class Problem:
     groups: tuple[Group, ...]
     dt: float  # [s] the longest step
     width: float  # [m] of smooth impacts
-    window: float  # [s] from the start of each record; what is later has no weight
+    window: float  # [s] from the start of each record; later values have no weight
     noise: dict[str, float]  # of columns whose noise is not given with their record
     free: Mapping[Any, Any]  # as the user gave it
     observe: Mapping[str, Any]  # likewise
@@ -179,7 +179,7 @@ def _resumed(found: list[Run], saved: Any, free: Mapping[Any, Any], places: Sequ
 
 
 def first_numbers(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """z of the values in the scenes: (a,), (b, R)."""
+    """Numbers z of the values in the scenes: (a,), (b, R)."""
     shared = [slot.kind.unbounded(np.asarray(_value(problem, slot))) for slot in problem.shared]
     own = [
         [slot.kind.unbounded(np.asarray(reference(slot, scene_of(run)))) for run in problem.runs]
@@ -191,7 +191,7 @@ def first_numbers(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
-    """z of the values in the scenes, and of `count` - 1 random starts."""
+    """Starts: z of the values in the scenes, and of `count` - 1 random ones."""
     random, (first, first_own) = np.random.default_rng(seed), first_numbers(problem)
     shared, own = [first], [first_own]
     for _ in range(count - 1):
@@ -237,7 +237,7 @@ def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def start_vector(problem: Problem) -> np.ndarray:
-    """z of the values in the scenes: the shared numbers, then those of each record, (a + R b,)."""
+    """Start as one vector: z of the values in the scenes, shared numbers, then those of each record, (a + R b,)."""
     shared, own = first_numbers(problem)
     return np.concatenate([shared, own.T.ravel()])
 
