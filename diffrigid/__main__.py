@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def paragraphs(text: str, **values: Any) -> list[str]:
-    """A text in paragraphs, values put in."""
+    """Split a text into paragraphs, with values put in."""
     return [" ".join(paragraph.format(**values).split()) for paragraph in text.strip().split("\n\n")]
 
 
@@ -126,7 +126,7 @@ def drop_scene(record: SquareDrops, drop: int) -> tuple[dr.World, State]:
 
 
 def drop_columns(record: SquareDrops, drop: int) -> dict[str, np.ndarray]:
-    """What was measured of a drop."""
+    """Measured columns of a drop."""
     return {"t": record.t, "square.x": record.x[drop], "square.angle": record.angle[drop]}
 
 

@@ -1,4 +1,4 @@
-"""Many worlds at once: the one place where the batch axis moves.
+"""Many worlds at once: the only place where the batch axis moves.
 
 Inside, the batch is the last axis, because on a CPU XLA vectorises the innermost one, and a batch runs in
 chunks whose temporaries stay in the cache, divided among the devices. Outside, the JAX convention holds: a leading
@@ -34,8 +34,8 @@ from diffrigid.step import (
 from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
 LANES = 2**15  # of a chunk: one for each contact, or more, and four for each body of its worlds
-# Lanes of a contact of shapes with corners: it is searched for, and is rarely alone; least and most worlds of a chunk.
-# Compiled for speed a small chunk costs no more calls, and what one world of it needs is computed for fewer.
+# Lanes of a contact of shapes with corners, which needs a search and is rarely alone; least and most worlds of a chunk.
+# Compiled for speed, small chunks cost no more calls, and what one world needs is computed for fewer others.
 CORNER, CORNER_FOR_SPEED = 32, 512
 LEAST, LEAST_FOR_SPEED = 2**5, 2**4
 MOST, MOST_FOR_SPEED = 2**12, 2**6
@@ -46,7 +46,7 @@ def rollout_batch(
     world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, controls: Any = None,
     chunk: int | None = None, memory: int = MEMORY,
 ) -> State:  # fmt: skip
-    """States of B worlds, from `world` and `state` of which any leaf may have a leading batch axis.
+    """States of B worlds, from `world` and `state`, any leaf of which may have a leading batch axis.
 
     Args:
         dt: [s].
@@ -56,7 +56,7 @@ def rollout_batch(
             worlds, or (B, T, D or A).
         chunk: worlds that run together; default: as many as fit the cache and `memory`.
         memory: [bytes] that reverse mode may use for saved states on each device. If a batch needs more, only the start
-            of each chunk is kept and the chunk is computed again; if one chunk needs more, see `rollout`.
+            of each chunk is kept and the chunk is recomputed; if one chunk needs more, see `rollout`.
 
     All JAX devices share the work, those of other processes too: then every process makes the same call,
     and the result lies where it was computed (`jax.experimental.multihost_utils.process_allgather` brings it together).
@@ -90,7 +90,7 @@ def rollout_batch(
 
 
 def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -> Any:
-    """Controls of the whole batch, with the batch last: (T, D or A, B), or 1 where they are alike."""
+    """Controls of the whole batch, with the batch last: (T, D or A, B), or of length 1 where all worlds share them."""
     if isinstance(controls, Mapping):
         sizes = controlled(world.forces)
         controls = {k: _batch_last(k, v, (steps, sizes[k]), count) if k in sizes else v for k, v in controls.items()}
@@ -98,7 +98,7 @@ def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -
 
 
 def _batch_last(name: str, value: Any, own: tuple[int, int], count: int) -> Any:
-    """(B, T, D or A) to (T, D or A, B); what is alike for all stays."""
+    """Move the batch of a control last, (B, T, D or A) to (T, D or A, B); one that all worlds share stays."""
     array = numbers(f"controls[{name!r}]", value, None)
     if array.shape not in (own, (count, *own)):
         raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {own} or {(count, *own)}.")
@@ -106,7 +106,7 @@ def _batch_last(name: str, value: Any, own: tuple[int, int], count: int) -> Any:
 
 
 def _check_leaves(world: World, state: State) -> None:
-    """Raise ValueError for what is no world or state, and for a leaf that has more than a batch axis and its own."""
+    """Raise ValueError unless given a world and a state, each leaf with at most one axis beside its own."""
     check_kinds(world, state)
     sizes = axis_sizes(world)
 
@@ -129,7 +129,7 @@ def _batch_sizes(tree) -> list[int]:
 
 
 def _chunk(world: World) -> int:
-    """Power of two of worlds whose contacts and bodies fill LANES."""
+    """Number of worlds of a chunk, a power of two, whose contacts and bodies fill LANES."""
     fast = is_for_speed()
     corner, least, most = (CORNER_FOR_SPEED, LEAST_FOR_SPEED, MOST_FOR_SPEED) if fast else (CORNER, LEAST, MOST)
 
@@ -150,7 +150,7 @@ def _state_bytes(world: World, state: State) -> int:
 
 
 def _batch_axes(world: World, controls: Any, count: int) -> list[int | None]:
-    """Of each leaf of the controls the axis of the batch, or None."""
+    """For each leaf of the controls, its batch axis or None."""
     names, leaves = controlled(world.forces), jax.tree_util.tree_leaves_with_path(controls)
     keys = [getattr(path[0], "key", None) if path else None for path, _ in leaves]
     own = [key in names and leaf.shape[-1] == count for key, (_, leaf) in zip(keys, leaves, strict=True)]

@@ -1,4 +1,4 @@
-"""Tracing and compiling sooner, or compiling for speed."""
+"""Options and helpers to trace and compile sooner, or to compile for speed."""
 
 import functools
 import gc
@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-# Without LLVM's optimisation one world runs a fifth to three times slower, and a batch, of which nothing is vectorised
-# then, five times. Its higher levels take longer to compile than the first and are no faster.
-UNFUSED = {"xla_cpu_use_fusion_emitters": False}  # with them a batch runs faster, and compiles twice as long
+# Without LLVM's optimisation one world runs slower, and a batch, of which nothing is vectorised then, much slower. Its
+# higher levels take longer to compile than the first and are no faster.
+UNFUSED = {"xla_cpu_use_fusion_emitters": False}  # with them a batch runs faster, but takes longer to compile
 LEVEL = "xla_backend_optimization_level"
 QUICK = UNFUSED | {LEVEL: 0, "xla_cpu_parallel_codegen_split_count": 1}
-# For what runs for longer than it compiles; where XLA_FLAGS sets a level, as in the tests, that holds.
+# For programs that run for longer than they compile; where XLA_FLAGS sets a level, as in the tests, that holds.
 LASTING = UNFUSED | ({} if LEVEL in os.environ.get("XLA_FLAGS", "") else {LEVEL: 1})
 # A loop whose step accesses fewer bytes is one function; short loops over the worlds are not written out one by one
 # before they are vectorised, as LLVM else does up to some hundred; and vectors are as wide as there are.
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 def uncollected(fn: Callable[Inputs, Result]) -> Callable[Inputs, Result]:
     """`fn` with Python's garbage collector paused, for functions that may trace a program.
 
-    Tracing creates hundreds of thousands of objects that all survive; scanning them takes a third of its time.
+    Tracing creates hundreds of thousands of objects that all survive; scanning them takes much of its time.
     """
 
     @functools.wraps(fn)
@@ -49,11 +49,11 @@ def uncollected(fn: Callable[Inputs, Result]) -> Callable[Inputs, Result]:
 
 
 def is_own_program() -> bool:
-    """Whether what JAX does now is not part of a program that it traces, of `jax.jit`, a loop or a branch.
+    """Whether JAX is outside jit, loops and branches: only there do compiler options apply.
 
-    Only then has `jax.jit` options of its own: in another program it has those of that one.
+    Inside another program `jax.jit` has the options of that one.
     """
-    return not isinstance(lax.neg(np.float32(0)), jax.core.Tracer)  # what is traced takes in every operation
+    return not isinstance(lax.neg(np.float32(0)), jax.core.Tracer)  # within a trace every operation is traced
 
 
 def compile_for_speed() -> None:
@@ -86,10 +86,10 @@ def compile_for_speed() -> None:
 
 
 def is_for_speed() -> bool:
-    """Whether JAX was told to compile as `compile_for_speed` has it."""
+    """Whether JAX was told to compile as by `compile_for_speed`."""
     return set(SPEED) <= set(os.environ.get("XLA_FLAGS", "").split())
 
 
 def _small_loop() -> jax.stages.Lowered:
-    """A loop that XLA makes one function only if told so: each step of it accesses more than a kilobyte."""
+    """A loop that XLA compiles to one function only if told so: each of its steps accesses more than a kilobyte."""
     return jax.jit(lambda x: lax.fori_loop(0, 2, lambda _, x: jnp.sin(x), x)).lower(jnp.zeros(1024))

@@ -1,7 +1,7 @@
-"""Errors of the joints of a world, and how they change with the motion of its bodies.
+"""Errors of the joints of a world, and their rates as its bodies move.
 
-J is the Jacobian of all errors by the twists (dx, dtheta) of the bodies. J u, the rate of J v and J^T lam are
-derivatives of the error function of a joint, in forward mode and by transposition; smooth wherever that is.
+J is the Jacobian of all errors with respect to the twists (dx, dtheta) of the bodies. J u, the rate of J v and J^T lam
+are derivatives of the error function of a joint, in forward mode and by transposition; smooth wherever that is.
 """
 
 import functools
@@ -37,7 +37,7 @@ def placed(joints: tuple, statics: Any, x: Array, q: Array) -> tuple[PlacedJoint
 
 
 def _poses(statics: Any, x: Array, q: Array) -> Pose:
-    """Of colliders: bodies, then statics, then the world, which stands at the origin."""
+    """Poses of all colliders: bodies, then statics, then the world, which is at the origin."""
     batch = x.shape[2:]
     still = [jnp.broadcast_to(leaf, leaf.shape[:2] + batch) for leaf in (statics.x, statics.q)]
     world = jnp.zeros_like(x[:1]), jnp.zeros_like(q[:1]).at[:, 0].set(1.0)
@@ -45,7 +45,7 @@ def _poses(statics: Any, x: Array, q: Array) -> Pose:
 
 
 def of_each(row: Callable, groups: tuple[PlacedJoints, ...], *args: Array) -> Array:
-    """`row(joint, a, b, *args)` of all n joints for args (n, ...), (n, E, *batch), filled up with zeros to E rows."""
+    """`row(joint, a, b, *args)` of all n joints, for args (n, ...): (n, E, *batch), padded with zeros to E rows."""
     parts, start = [], 0
     for group in groups:
         count = len(group.a.x)
@@ -70,13 +70,13 @@ def _tangents(so: ModuleType, a: Pose, b: Pose, u: Array) -> tuple[Pose, Pose]:
 
 
 def _acceleration(so: ModuleType, of: Callable, a: Pose, b: Pose, u: Array, du: Array) -> Array:
-    """Second derivative by time of a function of(a, b), for twists u and their rates du (2, D + A, *batch)."""
+    """Second time derivative of a function of(a, b), for twists u and their rates du (2, D + A, *batch)."""
     rate = functools.partial(change, so, of)
     return jax.jvp(rate, (a, b, u), (*_tangents(so, a, b, u), du))[1]
 
 
 def by_twists(so: ModuleType, of: Callable, a: Pose, b: Pose) -> Array:
-    """Jacobian of a function of(a, b) -> (E, *batch) by the twists of a, then b, (E, 2 (D + A), *batch)."""
+    """Jacobian of a function of(a, b) -> (E, *batch) for the twists of a, then b, (E, 2 (D + A), *batch)."""
     n, batch = so.D + so.A, a.x.shape[1:]
     units = jnp.eye(2 * n, dtype=a.x.dtype).reshape(2 * n, 2, n, *[1] * len(batch))
     units = units + jnp.zeros_like(a.x[:1])[None, None]
@@ -89,7 +89,7 @@ def _held(so: ModuleType, joint: Any) -> Callable:
 
 
 def joint_errors(so: ModuleType, groups: tuple[PlacedJoints, ...]) -> Array:
-    """(n, E, *batch) [m or rad]."""
+    """Errors of all n joints, (n, E, *batch) [m or rad]."""
     return of_each(lambda joint, a, b: joint(so, a, b), groups)
 
 
@@ -108,7 +108,7 @@ def joint_accelerations(so: ModuleType, groups: tuple[PlacedJoints, ...], twists
 
 
 def joint_jacobian(so: ModuleType, groups: tuple[PlacedJoints, ...]) -> Array:
-    """J by blocks, one for each of the two bodies of each joint, (n, E, 2, D + A, *batch)."""
+    """J in blocks, one for each of the two bodies of each joint, (n, E, 2, D + A, *batch)."""
     flat = of_each(lambda joint, a, b: by_twists(so, _held(so, joint), a, b), groups)
     return flat.reshape(*flat.shape[:2], 2, so.D + so.A, *flat.shape[3:])
 

@@ -1,6 +1,6 @@
-"""What is added to forces from outside, interval by interval: `controls` of `step`, `rollout` and `rollout_batch`.
+"""External inputs added to forces in each interval: `controls` of `step`, `rollout` and `rollout_batch`.
 
-A dictionary by the names that forces have as `control`. Forces of other kinds may read whatever they like.
+A dictionary by the names that forces have as `control`. Forces of other kinds may read it as they like.
 """
 
 from collections.abc import Mapping
@@ -14,14 +14,14 @@ from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
 
 
 def controlled(forces: tuple) -> dict[str, int]:
-    """How many numbers each control has, by its name."""
+    """Number of components of each control, by its name."""
     added = (force for force in forces if isinstance(force, Force | Torque))
     sizes = {force.control: len(force.F if isinstance(force, Force) else force.tau) for force in added}
     return {name: size for name, size in sizes.items() if name is not None}
 
 
 def as_controls(forces: tuple, controls: Any, dtype: Any, steps: tuple[int, ...], batch: tuple[int, ...] = ()) -> Any:
-    """Controls as arrays of a type.
+    """Check controls and convert them to arrays of a type.
 
     Args:
         steps: (T,), or () for one step.

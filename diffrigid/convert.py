@@ -1,4 +1,4 @@
-"""What users write, as arrays of one type: NumPy where the values are known, and then checked, else traced.
+"""Convert what users write to arrays of one type: NumPy where values are known, and then checked, else traced.
 
 Every function takes the name of the argument first, for its messages. Known values stay NumPy, because under
 `jit` even a constant is traced as soon as JAX holds it.
@@ -17,20 +17,20 @@ from diffrigid import so2
 from diffrigid.pytree import map_arrays, refuse_missing, replace
 from diffrigid.shapes import HalfSpace, dimension, traced, volume_properties, with_topology
 
-TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: what is typed has a few digits
-FLAT = 1e-9  # [-] of the largest principal inertia: what is smaller has no thickness
+TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: typed numbers have a few digits
+FLAT = 1e-9  # [-] of the largest principal inertia: a body with a smaller one has no thickness
 
 Numbers = Any  # np.ndarray where known, Array where traced
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """Text that lists the names most like one that does not exist."""
+    """Text that lists the names most similar to one that does not exist."""
     near = difflib.get_close_matches(str(name), sorted(names), n=3, cutoff=0.4)
     return f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(sorted(names))}."
 
 
 def known(fn: Callable, *args: Any) -> Any:
-    """fn(*args) in NumPy if all arguments are known, whatever is being traced around."""
+    """Evaluate fn(*args), in NumPy if all arguments are known, even inside a trace."""
     if traced(args):
         return fn(*args)
     with jax.ensure_compile_time_eval():
@@ -38,14 +38,14 @@ def known(fn: Callable, *args: Any) -> Any:
 
 
 def stack(rows: Sequence, shape: tuple[int, ...] = ()) -> Numbers:
-    """Rows along a new first axis; `shape` is that of one, needed where there are none."""
+    """Stack rows along a new first axis; `shape` is that of one row, needed where there are none."""
     if not rows:
         return np.zeros((0, *shape), jnp.result_type(float))
     return jnp.stack(rows) if traced(rows) else np.stack(rows)
 
 
 def numbers(where: str, value: Any, shape: tuple[int, ...] | None, finite: bool = True) -> Numbers:
-    """`value` as floats, of this shape unless None, and finite."""
+    """Check and convert `value` to floats, of this shape unless None, and finite."""
     expected = "numbers" if shape is None else "a number" if shape == () else f"numbers of shape {shape}"
     try:
         array = _array(value)
@@ -62,7 +62,7 @@ def numbers(where: str, value: Any, shape: tuple[int, ...] | None, finite: bool 
 
 
 def largest(dtype: Any) -> float:
-    """The largest number whose cube is finite; one over it is about the smallest whose cube is not zero."""
+    """Largest number whose cube is finite; its inverse is about the smallest whose cube is not zero."""
     return float(np.cbrt(float(jnp.finfo(dtype).max)))
 
 
@@ -80,14 +80,14 @@ def _array(value: Any) -> Numbers:
 
 
 def known_number(where: str, value: Any) -> Numbers:
-    """A number that is not traced."""
+    """Check and convert a number that must not be traced."""
     if traced(value):
         raise ValueError(f"{where} is traced: expected a number that is known.")
     return numbers(where, value, ())
 
 
 def positive(where: str, value: Any, fix: str) -> Numbers:
-    """A number above zero."""
+    """Check and convert a number above zero."""
     array = numbers(where, value, ())
     if not traced(array) and not array > 0:
         raise ValueError(f"{where} is {float(array):g}: expected above 0; {fix}.")
@@ -99,7 +99,7 @@ def positive(where: str, value: Any, fix: str) -> Numbers:
 
 
 def fraction(where: str, value: Any) -> Numbers:
-    """A coefficient of restitution."""
+    """Check and convert a coefficient of restitution."""
     array = numbers(where, value, ())
     if not traced(array) and not 0 <= array <= 1:
         raise ValueError(f"{where} is {float(array):g}: expected 0 (no rebound) to 1 (no loss); clip it.")
@@ -107,7 +107,7 @@ def fraction(where: str, value: Any) -> Numbers:
 
 
 def coefficient(where: str, value: Any) -> Numbers:
-    """A coefficient of friction, or the fall-off of restitution."""
+    """Check and convert a coefficient of friction, or the fall-off of restitution."""
     array = numbers(where, value, ())
     if not traced(array) and not array >= 0:
         raise ValueError(f"{where} is {float(array):g}: expected 0 or above; give it without sign.")
@@ -115,7 +115,7 @@ def coefficient(where: str, value: Any) -> Numbers:
 
 
 def materials(colliders: Mapping[str, Any], general: Mapping[str, Any]) -> dict[str, tuple[Any, tuple[bool, ...]]]:
-    """Of each coefficient the values of all colliders, and whether each was given to it.
+    """For each coefficient, the values of all colliders, and whether each was given to the collider itself.
 
     Args:
         general: values for those colliders that have none of their own; None: 0, and if none of the colliders has one
@@ -136,7 +136,7 @@ def materials(colliders: Mapping[str, Any], general: Mapping[str, Any]) -> dict[
 
 
 def orientation(name: str, body: Any, dim: int) -> Numbers:
-    """q of a body or static from its q or angle, (2,) or (4,), of length one."""
+    """Orientation q of a body or static, from its q or angle, (2,) or (4,), of length one."""
     if body.angle is not None:
         if body.q is not None:
             raise ValueError(f"{name}: got both angle and q; give one of them.")
@@ -149,7 +149,7 @@ def orientation(name: str, body: Any, dim: int) -> Numbers:
 
 
 def unit_quaternion(where: str, q: Numbers) -> Numbers:
-    """q, (2,) or (4,), of length one to rounding."""
+    """Check q, (2,) or (4,), and scale it to length one to rounding."""
     length = _length(q)
     if not traced(q) and abs(length - 1) > TYPED:
         raise ValueError(f"{where} has length {length:.6g}: expected 1; divide it by its length.")
@@ -161,7 +161,7 @@ def _length(vector: Numbers) -> Numbers:
 
 
 def angular_velocity(name: str, w: Any, dim: int) -> Numbers:
-    """w, (1,) or (3,); in 2D a number will do."""
+    """Check and convert w, (1,) or (3,); in 2D it may be a number."""
     size = 1 if dim == 2 else 3
     array = numbers(f"{name}.w", np.zeros(size) if w is None else w, None)
     return numbers(f"{name}.w", array[None] if dim == 2 and array.ndim == 0 else array, (size,))
@@ -180,7 +180,7 @@ class Solid(NamedTuple):
 
 
 def shape_of(name: str, shape: Any, dim: int) -> Any:
-    """A shape with float leaves and the topology of a hull filled in."""
+    """Convert a shape: float leaves, and the topology of a hull filled in."""
     if dimension(shape) not in (None, dim):
         kind = type(shape).__name__
         raise ValueError(f"{name}.shape is a {kind} of {dimension(shape)}D: use a shape of {dim}D, as the scene.")
@@ -224,7 +224,7 @@ def mass_and_inertia(name: str, body: Any, solid: Solid | None, dim: int) -> tup
 
 
 def _inertia(where: str, value: Any, dim: int) -> Numbers:
-    """An inertia about the centre of mass, () or (3, 3), from a number, or principal values or a matrix."""
+    """Inertia about the centre of mass, () or (3, 3), from a number, principal values or a matrix."""
     if dim == 2:
         return positive(where, value, "a point has none; give that of a small disc, m r^2 / 2")
     array = numbers(where, value, None)
@@ -251,7 +251,7 @@ def _inertia(where: str, value: Any, dim: int) -> Numbers:
 
 
 def by_name(what: str, records: Any, taken: Iterable[str]) -> dict[str, Any]:
-    """Forces or joints (`what`) by name: as given, or the class in lower case, numbered from the second on."""
+    """Forces or joints (`what`) by name: the given one, or the class in lower case, numbered from the second on."""
     if not isinstance(records, Mapping):
         if isinstance(records, str) or not isinstance(records, Sequence):
             raise ValueError(f"{what} is {records!r}: expected a sequence or a dict of {what}; add brackets.")
@@ -268,7 +268,7 @@ def by_name(what: str, records: Any, taken: Iterable[str]) -> dict[str, Any]:
 
 
 def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
-    """A force with indices for the names of bodies, and arrays with the axes of their fields for numbers."""
+    """Convert a force: indices for the names of bodies, and arrays with the axes of their fields for numbers."""
     if isinstance(force, type) or not callable(force) or not hasattr(force, "__dataclass_fields__"):
         raise ValueError(f"forces: {name!r} is {force!r}: expected a record such as Drag(linear=0.1).")
     refuse_missing(force, name)

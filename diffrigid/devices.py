@@ -1,4 +1,4 @@
-"""Work divided over all JAX devices, those of other processes too; with one device this does nothing.
+"""Divide work over all JAX devices, those of other processes too; with one device this does nothing.
 
 Devices do not communicate while they work, so each takes its own branches, and a pass that none of its worlds needs is
 skipped, which it would not be if XLA divided the program.
@@ -23,21 +23,21 @@ def devices() -> list[jax.Device]:
 
 
 def over_devices(fn: Callable, parts: Any, whole: Any) -> Any:
-    """fn(parts, whole), each device with its share.
+    """Evaluate fn(parts, whole), each device on its share.
 
     Args:
         parts: arrays divided along their leading axis, a multiple of the number of devices; so are the results.
-        whole: what every device gets all of; its derivatives are added up.
+        whole: arrays of which every device gets all; their derivatives are added up.
     """
     if len(devices()) == 1:
         return fn(parts, whole)
-    # Without the check of what varies from device to device, which does not know the loops and solves inside.
+    # Without the check of which values vary between devices: it does not support the loops and solves inside.
     specs = (SHARE, PartitionSpec())
     return jax.shard_map(fn, mesh=_mesh(), in_specs=specs, out_specs=SHARE, check_vma=False)(parts, whole)
 
 
 def everywhere(tree: Any) -> Any:
-    """Arrays of which every device has all, so that every process can read them."""
+    """Replicate arrays on every device, so that every process can read them."""
     if len(devices()) == 1:
         return tree
     return jax.lax.with_sharding_constraint(tree, NamedSharding(_mesh(), PartitionSpec()))
@@ -48,14 +48,14 @@ def _mesh() -> Mesh:
 
 
 def pieces_of(count: int, most: int) -> tuple[int, int]:
-    """How many pieces, a multiple of the number of devices, and how long: `count` worlds or some more, `most` each."""
+    """Number of pieces, a multiple of that of devices, and their length, at most `most`, for `count` worlds or more."""
     many = len(devices())
     pieces = many * -(-count // (many * most))
     return pieces, -(-count // pieces)
 
 
 def cut(leaf: Array, axis: int, pieces: int, length: int) -> Array:
-    """One axis in `pieces`, (pieces, ..., length): filled up with copies of the last world."""
+    """Cut one axis into `pieces`, (pieces, ..., length), filled up with copies of the last world."""
     leaf = jnp.moveaxis(leaf, axis, 0)
     short = pieces * length - leaf.shape[0]
     leaf = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], short, axis=0)]) if short else leaf

@@ -3,7 +3,7 @@
 The matrix J M^-1 J^T has a block for every joint, and one for every two joints with a body in common. A set of joints
 of which no two are coupled is eliminated at once, then a set of those that are left, and so on; in a chain every
 second joint goes first, so that 100 links take seven such levels. Which joints those are, and which blocks fill in,
-is found when tracing, from who is joined to whom.
+is found when tracing, from which bodies are joined.
 
 The matrix is positive semidefinite, so no pivoting is needed. A pivot that is zero to rounding, as of an equation
 that repeats others, is left out: the solution is then one of many, and finite. Where joints form a tree there is none.
@@ -22,11 +22,11 @@ from jax import Array, lax
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.gathers import rows_or_zeros
 
-ROUNDING = 1e2  # times the spacing of numbers at the diagonal: a pivot of a loop that is no larger is zero
+ROUNDING = 1e2  # [-] times eps times the diagonal: where joints form loops, a pivot no larger counts as zero
 
 
 class Level(NamedTuple):
-    """What is eliminated at once, P joints with up to S neighbours each, as indices into what is left until then.
+    """One level of the elimination: P joints with up to S neighbours each, as indices into what is left before it.
 
     -1 stands for a block or a row of zeros.
     """
@@ -34,14 +34,14 @@ class Level(NamedTuple):
     pivots: tuple[int, ...]  # (P,) rows
     blocks: tuple[tuple[int, ...], ...]  # (P, 1 + S) blocks of each pivot with itself and its neighbours
     after: tuple[tuple[int, ...], ...]  # (P, S) the neighbours, among the solutions of later levels
-    kept: tuple[int, ...]  # blocks that are left then
+    kept: tuple[int, ...]  # blocks that are left after it
     sums: tuple[tuple[int, ...], ...]  # for each of them, the products (P S S) to take off
     kept_rows: tuple[int, ...]
     row_sums: tuple[tuple[int, ...], ...]  # for each row that is left, the products (P S) to take off
 
 
 class Plan(NamedTuple):
-    """How the system of n joints is solved."""
+    """Plan for solving the system of n joints."""
 
     pairs: tuple[tuple[int, int], ...]  # of coupled joints, the one eliminated first in front
     levels: tuple[Level, ...]
@@ -51,7 +51,7 @@ class Plan(NamedTuple):
 
 @functools.cache
 def plan(ends: tuple[tuple[int, int], ...], moving: int) -> Plan:
-    """For joints between colliders; those from `moving` on stand still, and couple nothing."""
+    """Make the plan for joints between these colliders; those from `moving` on are static, and couple nothing."""
     on = [{body for body in pair if body < moving} for pair in ends]
     graph = {i: {j for j in range(len(on)) if j != i and on[i] & on[j]} for i in range(len(on))}
     sets = _independent_sets({i: set(near) for i, near in graph.items()})
@@ -69,7 +69,7 @@ def plan(ends: tuple[tuple[int, int], ...], moving: int) -> Plan:
 
 
 def _independent_sets(graph: dict[int, set[int]]) -> list[list[int]]:
-    """Joints to eliminate one set after the other, those with few neighbours first. Empties the graph."""
+    """Sets of joints to eliminate one after the other, those with few neighbours first. Empties the graph."""
     sets = []
     while graph:
         most, chosen, near = max(2, min(map(len, graph.values()))), [], set()
@@ -123,7 +123,7 @@ def _level(pivots, blocks, left, later, first) -> tuple[Level, list, list]:
 
 
 def _is_tree(ends: tuple[tuple[int, int], ...], moving: int) -> bool:
-    """No loops; all that stands still is one."""
+    """Whether the joints form no loops; all statics count as one body."""
     root = list(range(moving + 1))
 
     def top(i):
@@ -140,14 +140,14 @@ def _is_tree(ends: tuple[tuple[int, int], ...], moving: int) -> bool:
 
 
 class Factor(NamedTuple):
-    """A level as eliminated."""
+    """Factors of one level."""
 
     inverse: Array  # (P, E, E, *batch) of the blocks of the pivots
     near: Array  # (P, S, E, E, *batch) inverse times the blocks with the neighbours
 
 
 def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
-    """All levels, from the blocks (n + pairs, E, E, *batch) of the joints with themselves, then of `plan.pairs`."""
+    """Factors of all levels, from blocks (n + pairs, E, E, *batch) of joints with themselves, then of `plan.pairs`."""
     count, rounding = len(plan.places), 0.0 if plan.is_tree else ROUNDING * jnp.finfo(blocks.dtype).eps
     tiny = rounding * jnp.stack([blocks[:count, e, e] for e in range(blocks.shape[1])], axis=1)
     factors, live = [], opaque_true(blocks)
@@ -165,7 +165,7 @@ def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
 
 
 def substitute(plan: Plan, factors: tuple[Factor, ...], right: Array) -> Array:
-    """The solution for a right-hand side (n, E, *batch)."""
+    """Solve for a right-hand side (n, E, *batch)."""
     pivots, right = [], right[:, :, None]
     for level, factor in zip(plan.levels, factors, strict=True):
         own = rows_or_zeros(right, level.pivots)
@@ -184,7 +184,7 @@ def substitute(plan: Plan, factors: tuple[Factor, ...], right: Array) -> Array:
 
 
 def _inverse(matrix: Array, tiny: Array) -> Array:
-    """Of matrices (P, E, E, *batch), by sweeps (Beaton 1964); a pivot not above `tiny` (P, E, *batch) is left out."""
+    """Invert matrices (P, E, E, *batch) by sweeps (Beaton 1964); pivots up to `tiny` (P, E, *batch) are left out."""
 
     def sweep(k, matrix):
         column = lax.dynamic_index_in_dim(matrix, k, 2, keepdims=False)
@@ -201,7 +201,7 @@ def _inverse(matrix: Array, tiny: Array) -> Array:
 
 
 def _product(a: Array, b: Array, axis: int) -> Array:
-    """Products of matrices with rows on `axis`, columns behind. Term by term: XLA does not vectorise a short sum."""
+    """Multiply matrices with rows on `axis`, columns after it. Term by term: XLA does not vectorise a short sum."""
 
     def term(k):
         return lax.slice_in_dim(a, k, k + 1, axis=axis + 1) * lax.slice_in_dim(b, k, k + 1, axis=axis)
@@ -210,5 +210,5 @@ def _product(a: Array, b: Array, axis: int) -> Array:
 
 
 def _less(values: Array, taken: Array, sums: tuple[tuple[int, ...], ...]) -> Array:
-    """Values (K, ...) less those of `taken` that belong to each."""
+    """Subtract from each of the values (K, ...) those of `taken` that `sums` lists for it."""
     return values if not sums[0] else values - rows_or_zeros(taken, sums).sum(1)

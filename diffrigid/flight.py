@@ -9,9 +9,9 @@ goes from there, with t = s - t0 and T its whole duration:
     q(s) = exp(carry t) o q o exp(sum_k turn[k] t^(k+1))    exponential map
 
 A constant force has none of jerk, jolt and twist, and `free_turn` for the rotation, or `turn_series` with a torque.
-Forces that vary, and those of joints, are integrated by the classical rule of Runge and Kutta, in the rotation vector
-for the orientation (Munthe-Kaas 1998): fourth order. Then jerk, jolt, twist and turn are those of the curves that end
-where it ends.
+Forces that vary, and those of joints, are integrated by the classical Runge-Kutta method, in the rotation vector for
+the orientation (Munthe-Kaas 1998): fourth order. Then jerk, jolt, twist and turn are those of curves that end where
+the integration ends.
 """
 
 from typing import Any
@@ -88,7 +88,7 @@ class Motion:
 
 
 def has_torque(world: Any) -> bool:
-    """Whether joints or forces act on a body beside its centre, or turn it. Static."""
+    """Whether joints or forces exert torques. Static."""
     return bool(world.joints) or any(getattr(force, "twists", True) for force in world.forces)
 
 
@@ -133,9 +133,9 @@ def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion
 
 
 def _along(f: Flight, first: Motion, mean: Motion, early: Array, last: Array, T: Array, has_torque: bool) -> Flight:
-    """The flight on the curves with these rates, as `_runge_kutta` returns them; where T is 0 they are straight.
+    """The flight along curves with these rates, as `_runge_kutta` returns them; straight where T is 0.
 
-    From rates, not from positions: over a short time after an impact those differ by less than they are rounded.
+    From rates, not from positions, whose differences over a short time after an impact are smaller than their rounding.
     """
     T = T[:, None]
     f = replace(

@@ -79,7 +79,7 @@ class Force:
 
     @property
     def constant(self) -> bool:
-        """Unless there is an arm, which turns with the body."""
+        """True for a force at the centre of mass; with an arm the torque varies as the body turns."""
         return self.point is None
 
     @property
@@ -123,8 +123,8 @@ class SpringDamper:
     """Spring and damper along the line between two points: F = -stiffness (l - length) - damping dl/dt.
 
     Anchors are in body axes, from the centre of mass; `b=None` ties to the world, and `anchor_b` is a world
-    point. Where the two points coincide the line is that along which they part, and none where they rest: the force is
-    differentiable there if `length` is 0, and kinked else.
+    point. Where the two points coincide, the line is that of their relative velocity, or none if they rest: the force
+    is differentiable there if `length` is 0, and has a kink otherwise.
 
     Example:
         >>> spring = dr.SpringDamper(a="ball", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=4 * np.pi**2)
@@ -171,17 +171,17 @@ class SpringDamper:
 
 
 def is_constant(forces: tuple) -> bool:
-    """True if no wrench changes within a step."""
+    """Whether no wrench changes within a step."""
     return all(getattr(force, "constant", False) for force in forces)
 
 
 def is_uniform(forces: tuple) -> bool:
-    """True if all bodies fall alike."""
+    """Whether all bodies have the same constant acceleration."""
     return all(getattr(force, "uniform", False) for force in forces)
 
 
 def total_wrench(forces: tuple, bodies: Bodies, state: State, controls: Any) -> Wrench:
-    """Sum of all forces; the torque is None when no force has one."""
+    """Sum of all wrenches; the torque is None when no force has one."""
     F, tau = jnp.zeros_like(state.v), None
     for force in forces:
         wrench = force(bodies, state, controls)

@@ -1,7 +1,7 @@
-"""Rows of arrays that are picked, summed and packed by indices that are known when tracing.
+"""Pick, sum and pack rows of arrays by indices that are known when tracing.
 
 XLA does not vectorise a gather on a CPU, and runs a scatter, its transpose, row by row: each function here gathers only
-where slices and reshapes do not do, and the transpose of what is gathered is a sum of what is gathered in turn.
+where slices and reshapes do not suffice, and the transpose of a gather is a sum of gathered rows in turn.
 """
 
 import functools
@@ -16,11 +16,11 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-FEW, MANY = 12, 40  # terms of a sum that is written out: where there are many such sums, where there are few
+FEW, MANY = 12, 40  # terms up to which a sum is unrolled: where there are many such sums, where there are few
 
 
 def rows(values: Array, index: tuple) -> Array:
-    """values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples."""
+    """Gather values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples."""
     first, flat = index[0], not isinstance(index[0], tuple)
     if flat and index == (first,) * len(index):
         return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))
@@ -46,7 +46,7 @@ def _shape(values: Any, *, index: tuple, axis: int) -> ShapedArray:
 
 
 def _summed_back(cotangent: Array, values: Any, *, index: tuple, axis: int) -> tuple[Array]:
-    """The transpose of `_picked`: to each row the sum of all that came of it. Its own would be a scatter."""
+    """Transpose of `_picked`: for each row, the sum over its copies. JAX's own would be a scatter."""
     shape = values.aval.shape
     flat = cotangent.reshape(*shape[:axis], -1, *shape[axis + 1 :])
     return (_sums(flat, _places(index, shape[axis]), axis),)
@@ -68,7 +68,7 @@ mlir.register_lowering(_pick, mlir.lower_fun(_picked, multiple_results=False))
 
 @functools.cache
 def _places(index: tuple, count: int) -> tuple[tuple[int, ...], ...]:
-    """For each of `count` rows where it is in the flat index, padded by -1."""
+    """For each of `count` rows, its places in the flat index, padded by -1."""
     where: list[list[int]] = [[] for _ in range(count)]
     for place, i in enumerate(np.ravel(index).tolist()):
         if i >= 0:
@@ -78,7 +78,7 @@ def _places(index: tuple, count: int) -> tuple[tuple[int, ...], ...]:
 
 
 def _sums(values: Array, index: tuple[tuple[int, ...], ...], axis: int = 0) -> Array:
-    """Sums of rows of values along an axis, which is as long as the index then."""
+    """Sums of rows of values along an axis, one for each row of the index."""
     table = _pick.bind(values, index=index, axis=axis)
     return fold(jnp.add, table, axis + 1) if len(index[0]) <= FEW else table.sum(axis + 1)
 
@@ -86,8 +86,8 @@ def _sums(values: Array, index: tuple[tuple[int, ...], ...], axis: int = 0) -> A
 def sum_rows(values: Array, index: tuple) -> Array:
     """Sums of rows of values (M, ...), for an index known when tracing, (len(index), ...). An index of M adds 0.
 
-    Where each sum is over a run of rows and one run follows the other, it is written out. Else rows are gathered,
-    padded to the most that any sum has: forward that is one fused loop, where a scatter is a serial one.
+    Where each sum is over a run of rows and one run follows the other, it is unrolled. Else rows are gathered, padded
+    to the largest number that any sum has: forward that is one fused loop, where a scatter is a serial one.
     """
     distinct = tuple(dict.fromkeys(index))
     runs = [tuple(i for i in row if i < len(values)) for row in distinct]
@@ -106,12 +106,12 @@ def sum_rows(values: Array, index: tuple) -> Array:
 
 
 def fold(op: Any, table: Array, axis: int) -> Array:
-    """Reduction over one axis in front of the batch. Written out: XLA's own is slow."""
+    """Reduce over one axis in front of the batch. Unrolled: XLA's own reduction is slow."""
     return functools.reduce(op, (lax.index_in_dim(table, k, axis, keepdims=False) for k in range(table.shape[axis])))
 
 
 def first_highest(values: list[Array]) -> list[Array]:
-    """Of each of some values (...), whether it is the first of the highest, (...) bool."""
+    """Whether each of some values (...) is the first of the highest, (...) bool."""
     highest, chosen = functools.reduce(jnp.maximum, values), []
     left = highest == highest
     for value in values:
@@ -127,7 +127,7 @@ def rows_or_zeros(values: Array, index: tuple) -> Array:
 
 
 def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]], Any]]:
-    """The leaves (M, ..., *batch) of a tree side by side, as one array (M, F, *batch) for each shape of the batch.
+    """Pack the leaves (M, ..., *batch) of a tree into one array (M, F, *batch) for each shape of the batch.
 
     Returns:
         the arrays, and the function that makes the tree from such arrays again, whatever their leading length.
@@ -155,14 +155,14 @@ def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]
 
 @functools.cache
 def constant(table: tuple, dtype: str) -> np.ndarray:
-    """A tuple, or a tuple of tuples, as an array that is made once.
+    """A tuple, or a tuple of tuples, as an array that is made only once.
 
-    A NumPy array made on the spot would be an argument of every loop and branch around it, and one of what reverse mode
-    saves: a program of some hundred contacts took three times as long to compile.
+    A NumPy array made on the spot would be an argument of every loop and branch around it, and among what reverse mode
+    saves: a program with many contacts then takes much longer to compile.
     """
     return np.array(table, dtype)
 
 
 def flags(values: tuple[bool, ...], like: Array) -> Array:
-    """Flags that are known when tracing as an array with the batch axes of `like`, (C, 1, ...)."""
+    """Flags known when tracing, as an array with the batch axes of `like`, (C, 1, ...)."""
     return jnp.asarray(constant(values, "bool")).reshape(len(values), *[1] * (like.ndim - 1))

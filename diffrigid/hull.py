@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-FLAT = 1e-5  # relative to the size of a shape, or rad: what is flatter is flat; above the rounding of float32
+FLAT = 1e-5  # of a shape's size, or rad: less than this counts as flat; above the rounding of float32
 
 
 def hull_faces(vertices) -> tuple:

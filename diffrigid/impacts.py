@@ -1,4 +1,4 @@
-"""Where bodies of a trajectory touch, and with what impulses. NumPy.
+"""Contacts between the bodies of a trajectory, and their impulses. NumPy.
 
 A trajectory stores states, not impulses, so they are inferred, one interval between two stored times after the other:
 
@@ -7,8 +7,8 @@ A trajectory stores states, not impulses, so they are inferred, one interval bet
     impulses       the smallest that, at these points and in the joints, explain the changes of momentum and angular
                    momentum beyond what the forces do in the interval (least norm: where points share a load, equally)
 
-What touches a `Profile` or a `HeightField` is not found, and what it does is taken for that of other contacts of the
-same bodies. Nor are contacts within a crowd, which lists no pairs. Exact for a body with one contact.
+Contacts with a `Profile` or a `HeightField` are not found, and their effect is attributed to other contacts of the same
+bodies. Nor are contacts within a crowd, which lists no pairs. Exact for a body with one contact.
 """
 
 import functools
@@ -27,16 +27,16 @@ from diffrigid.touch import Convex, gaps, rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.world import World
 
-SLOP = 2e-3  # of the smaller size: what counts as touching
-WORK = 4_000_000  # pairs times intervals beyond which not all stored times are looked at
-ROUGH = 5.0  # an impulse that exceeds what the forces do in an interval by this factor is an impact
+SLOP = 2e-3  # [-] of the smaller size: gap up to which bodies touch
+WORK = 4_000_000  # pairs times intervals beyond which not all stored times are examined
+ROUGH = 5.0  # [-] an impulse that exceeds that of the forces in an interval by this factor is an impact
 
 
 class Meetings(NamedTuple):
     """Contacts of a trajectory, in order of time; M of them. Colliders are numbered as in `World`."""
 
     t: np.ndarray  # (M,) [s]
-    impact: np.ndarray  # (M,) bool: an impact, or rest
+    impact: np.ndarray  # (M,) bool: an impact, else rest
     a: np.ndarray  # (M,) colliders
     b: np.ndarray
     point: np.ndarray  # (M, D) [m]
@@ -65,7 +65,7 @@ class Sampled(NamedTuple):
 
 
 def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meetings:
-    """When, where and with what impulses bodies of a trajectory touch, M contacts in order of time.
+    """Find when, where and with what impulses bodies of a trajectory touch: M contacts in order of time.
 
     `t` (M,) [s], `impact` (M,) or else rest, colliders `a` and `b` (M,) numbered as bodies, then statics; in world axes
     `point` (M, D) [m] and `impulse` (M, D) [N s] on `a`, or on `b` where only that moves. NumPy, without derivatives.
@@ -113,7 +113,7 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
 
 
 def order_of_impacts(trajectory: Trajectory) -> tuple[str, ...]:
-    """Which pairs strike each other, one after the other: ("cue-ball", "ball-wall").
+    """Names of the pairs that strike each other, in order of time: ("cue-ball", "ball-wall").
 
     Several points of one pair at a time are one impact. Those of different pairs that are closer in time than a
     hundredth of a step count as simultaneous, and are listed by name, so that rounding does not tell them apart.
@@ -145,8 +145,8 @@ def _motion(trajectory: Trajectory) -> Sampled:
 
 
 def _changes(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """By interval and body: change of momentum (T, N, D) and of angular momentum (T, N, A) beyond that of the forces,
-    and the size of what the forces did, (T, N), all [N s]."""
+    """By interval and body: change of momentum (T, N, D) and of angular momentum (T, N, A) beyond that by the forces,
+    and the size of the impulse of the forces, (T, N), all [N s]."""
     bodies, h = trajectory.world.bodies, np.diff(trajectory.t)[:, None, None]
     state = jax.tree.map(lambda leaf: leaf.astype(bodies.mass.dtype), trajectory.state)
     *both, wrench = _momenta(trajectory.world.forces, bodies, state, trajectory.controls)
@@ -161,7 +161,7 @@ def _changes(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 @jax.jit
 def _momenta(forces: tuple, bodies: Bodies, states: State, controls: Any) -> tuple[Array, Array, Wrench]:
-    """Of states (T+1, ...): momenta and angular momenta, and the means of the forces at both ends of each interval."""
+    """Momenta and angular momenta of states (T+1, ...), and the mean of the forces at both ends of each interval."""
 
     def wrench(state, controls):
         return total_wrench(forces, bodies, state, controls)
@@ -228,7 +228,7 @@ def _side(world: World, group: int) -> Convex:
 
 @functools.cache
 def _box_faces() -> tuple:
-    """Of any box, one without thickness included."""
+    """Faces of any box, one without thickness included."""
     return tuple(hull_faces(np.array(vertices(Box(half=(1.0, 1.0, 1.0)), 3), float)))
 
 
@@ -245,7 +245,7 @@ def _flown(motion: Sampled, k: np.ndarray, body: np.ndarray, s: np.ndarray) -> t
 
 
 def _meeting(at, h: np.ndarray, flying: np.ndarray) -> np.ndarray:
-    """Times (M,) when the least gap becomes zero, by bisection; 0 for those that lie together."""
+    """Times (M,) at which the least gap becomes zero, by bisection; 0 for those that touch from the start."""
     s, chosen = np.zeros(len(h)), np.flatnonzero(flying)
     low, high = np.zeros(len(chosen)), h[chosen].copy()
     for _ in range(14 if len(chosen) else 0):
@@ -257,7 +257,7 @@ def _meeting(at, h: np.ndarray, flying: np.ndarray) -> np.ndarray:
 
 
 def _repeated(point: np.ndarray, near: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Candidates (M, C) that lie where an earlier one of the same pair does."""
+    """Whether candidates (M, C) are at the place of an earlier one of the same pair."""
     repeated, several = np.zeros_like(near), np.flatnonzero(near.sum(1) > 1)
     for row in several:
         chosen = np.flatnonzero(near[row])
@@ -292,7 +292,7 @@ def _impulses(world: World, motion: Sampled, touch: Touch, dp: np.ndarray, dL: n
 
 
 def _islands(ends: np.ndarray, moving: int) -> np.ndarray:
-    """For each of the moving bodies the least number of those it hangs together with, through `ends` (2, C)."""
+    """Connected component of each moving body, through `ends` (2, C): the smallest index of the bodies in it."""
     label, (a, b) = np.arange(moving), ends[:, (ends < moving).all(0)]
     while (label[a] != label[b]).any():
         least = np.minimum(label[a], label[b])

@@ -1,4 +1,4 @@
-"""From joints as users write them to the records of a `World`: names, what is taken from the start, and mistakes."""
+"""From joints as users write them to the records of a `World`: names, values from the initial poses, and checks."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from diffrigid.state import rotations
 def joints_of(
     joints: Mapping[str, Any], moving: Sequence[str], still: Sequence[str], x: Any, q: Any, dim: int
 ) -> tuple:
-    """Joints of one kind in one record each, and their names.
+    """Put the joints of each kind into one record; return the records, and the names in each.
 
     Args:
         x, q: poses of all bodies, then all statics.
@@ -58,7 +58,7 @@ def joints_of(
 
 
 def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: int) -> Any:
-    """The joint with colliders for names, the world being the last, and arrays in all its fields."""
+    """The joint with collider indices for names, the world being the last, and arrays in all its fields."""
     so = rotations(dim)
     ends = {"a": colliders.index(joint.a), "b": len(colliders) if joint.b is None else colliders.index(joint.b)}
     world: Any = Pose(np.zeros(dim, jnp.result_type(float)), np.eye(so.Q, dtype=jnp.result_type(float))[0])  # type: ignore[arg-type]
@@ -81,7 +81,7 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
 
 
 def _given(name: str, joint: Any, fields: list[str], dim: int) -> dict[str, Any]:
-    """What the user gave, as arrays: axes and orientations of length one."""
+    """Fields that the user gave, as arrays; axes and orientations have length one."""
     shapes = {(): (), ("D",): (dim,), ("Q",): (rotations(dim).Q,)}
     given: dict[str, Any] = {}
     for field in fields:
@@ -101,7 +101,7 @@ def _given(name: str, joint: Any, fields: list[str], dim: int) -> dict[str, Any]
 
 
 def _from_start(so: Any, fields: list[str], given: dict[str, Any], a: Pose, b: Pose) -> dict[str, Any]:
-    """What was not given, from where the bodies are at the start."""
+    """Fields that were not given, from the initial poses of the bodies."""
     at_start = {
         "anchor_b": lambda a, b, given: so.unrotate(b.q, a.x + so.rotate(a.q, given["anchor_a"]) - b.x),
         "axis_b": lambda a, b, given: so.unrotate(b.q, so.rotate(a.q, given["axis_a"])),
@@ -115,7 +115,7 @@ def _from_start(so: Any, fields: list[str], given: dict[str, Any], a: Pose, b: P
 
 
 def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:
-    """Raise ValueError for limits, friction or damping that cannot be."""
+    """Raise ValueError for impossible limits, friction or damping."""
     given = {f: getattr(joint, f, None) for f in ("lower", "upper", "restitution", "friction", "speed", "damping")}
     number = {f: float(value) for f, value in given.items() if value is not None and not traced(value)}
     lower, upper = number.get("lower", -np.inf), number.get("upper", np.inf)
@@ -143,7 +143,7 @@ def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:
 
 
 def warn_of_torn_joints(world: Any, state: Any) -> None:
-    """Warn of joints whose bodies move apart at the start."""
+    """Warn of joints that the initial velocities violate."""
     if not world.joints:
         return
 

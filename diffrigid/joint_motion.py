@@ -1,8 +1,8 @@
-"""The angle of a hinge, the translation of a slider, and their rates, as numbers that are read from a state and set.
+"""Read and set the angle of a hinge, the translation of a slider, and their rates, in a state.
 
-To set one moves what hangs on one side of the joint as a rigid body, against the body on the other side, and closes
-the joint where its anchors do not meet. The side moves that no other joint holds to a static or to the world; if both
-are free, that of body a.
+Setting one moves all bodies on one side of the joint as a rigid body, against the body on the other side, and closes
+the joint where its anchors do not meet. The side that moves is the one that no other joint holds to a static or to the
+world; if both are free, that of body a.
 """
 
 import functools
@@ -24,7 +24,7 @@ RATE = "rate"
 
 
 def fields_of(joint: Any) -> tuple[str, ...]:
-    """What can be read and set of a joint: "angle" or "translation", and "rate"."""
+    """Names of what can be read and set of a joint: "angle" or "translation", and "rate"."""
     return (COORDINATE[type(joint)], RATE) if type(joint) in COORDINATE else ()
 
 
@@ -39,7 +39,7 @@ def read(world: Any, state: State, name: str, field: str) -> Array:
 
 
 def write(world: Any, state: State, name: str, field: str, value: Array) -> State:
-    """The state, without batch axes, in which `read` gives the value. Velocities turn with the bodies."""
+    """Change a state, without batch axes, so that `read` gives the value. Velocities turn with the bodies."""
     side, bodies = moving_side(world, name)
     by, rows = value - read(world, state, name, field), jnp.array(bodies)
     motion = _motion(world, _at(world, state, name), side, by)
@@ -48,9 +48,9 @@ def write(world: Any, state: State, name: str, field: str, value: Array) -> Stat
 
 
 def moving_side(world: Any, name: str) -> tuple[int, tuple[int, ...]]:
-    """Which side of a joint moves when it is set, 0 for that of a, and its bodies, that of the joint first.
+    """Side of a joint that moves when it is set, 0 for that of a, and its bodies, that of the joint first.
 
-    No bodies if both sides hang together without the joint, so that neither moves alone.
+    No bodies if both sides are connected without the joint, so that neither moves alone.
     """
     index = [joint for names in world.joint_names for joint in names].index(name)
     return _moving_side(ends_of(world.joints), index, len(world.names))
@@ -58,7 +58,7 @@ def moving_side(world: Any, name: str) -> tuple[int, tuple[int, ...]]:
 
 @functools.cache
 def _moving_side(ends: tuple[tuple[int, int], ...], index: int, moving: int) -> tuple[int, tuple[int, ...]]:
-    grounded = [(min(a, moving), min(b, moving)) for a, b in ends]  # one body for all that stands still
+    grounded = [(min(a, moving), min(b, moving)) for a, b in ends]  # one body for all statics
     a, b = grounded[index]
     sides = islands(grounded[:index] + grounded[index + 1 :], moving + 1)
     if b in sides[a]:
@@ -86,9 +86,9 @@ def _at(world: Any, state: State, name: str) -> _At:
 
 
 class _Motion(NamedTuple):
-    """How one side of a joint moves against the other, the base, when its coordinate changes."""
+    """Motion of one side of a joint against the other, the base, when its coordinate changes."""
 
-    way: Array  # (D,) [m] of the anchor along the axis of a slider, or its change of velocity
+    way: Array  # (D,) [m] displacement of the anchor along the axis of a slider, or its change of velocity
     turn: Array  # (A,) [rad] about the axis of a hinge, or its change of angular velocity
     along: Array | None  # (D,) axis along which the anchor may move; None: it stays on that of the base
     anchor: Array  # (D,) [m] on the side that moves
@@ -114,7 +114,7 @@ def _motion(world: Any, at: _At, side: int, by: Array) -> _Motion:
 
 
 def _moved(state: State, motion: _Motion, rows: Array) -> dict[str, Array]:
-    """The bodies `rows` with the anchor where it belongs, and moved from there; relative velocities turn with them."""
+    """Move the bodies `rows`, with the anchor closed first; velocities relative to the base turn with them."""
     so = rotations(state.x.shape[1])
     (own, own_x), (base, base_x) = motion.own, motion.base
     turned, target = so.exp(motion.turn), motion.pivot + motion.way

@@ -3,13 +3,13 @@
 A joint is called as `joint(so, a, b)` with the poses (x, q) of its two bodies and returns its error, (E, *batch)
 [m or rad], which is zero where the joint holds. To add one, write such a record and its entry in `JOINTS`.
 
-One with a `coordinate`, its angle or its way, may have limits, friction, a motor and damping along it:
+A joint with a `coordinate`, an angle or a translation, may have limits, friction, a motor and damping along it:
 
     lower, upper    the coordinate stays between; it rebounds there with `restitution`. Orientations do not tell how
                     often a hinge has turned round: its angle is counted within half a turn of the middle of its limits,
                     and with one limit from an eighth of a turn beyond it
-    friction        the most that resists a rate other than `speed`: dry friction, or a motor if there is a speed
-    damping         times the rate: viscous friction
+    friction        largest force or torque against a rate other than `speed`: dry friction; a motor if there is a speed
+    damping         force or torque per rate: viscous friction
 """
 
 from types import ModuleType
@@ -25,7 +25,7 @@ from diffrigid.so3 import tangents
 
 
 class Pose(NamedTuple):
-    """Where a body is."""
+    """Pose of a body."""
 
     x: Array  # (D, *batch) [m] centre of mass
     q: Array  # (Q, *batch)
@@ -36,8 +36,8 @@ class Revolute:
     """A hinge: two points stay together and, in 3D, two axes stay parallel.
 
     Anchors and axes are in body axes, from the centre of mass; for `b=None`, the world, anchor_b is a world
-    point. What is not given of b is taken from where the bodies are at the start, and there, in 3D or with limits,
-    the angle is 0; else it is the difference of the angles of both.
+    point. What is not given of b is taken from the initial poses of the bodies, where, in 3D or with limits, the angle
+    is 0; else it is the difference of the angles of both.
 
     Example:
         >>> door = dr.Body(None, mass=9.0, inertia=0.6, x=(0.4, 0.0))
@@ -80,7 +80,7 @@ class Revolute:
 
 
 def middle_of(lower: Any, upper: Any) -> Any:
-    """Angle [rad] half a turn from that at which the angle of a hinge jumps; None: there are no limits."""
+    """Middle [rad] of the turn in which the angle of a hinge is counted, by its limits; None: there are none."""
     if lower is not None and upper is not None:
         return 0.5 * (lower + upper)
     if lower is not None:
@@ -160,7 +160,7 @@ class Prismatic:
         return jnp.concatenate([off_line, _turn(self, so, a, b)])
 
     def coordinate(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        """Way of anchor a from anchor b along the axis, (*batch) [m]."""
+        """Translation of anchor a relative to anchor b along the axis, (*batch) [m]."""
         return dot(so.rotate(b.q, self.axis_b), separation(self, so, a, b))
 
 
@@ -189,10 +189,10 @@ JOINTS = (Revolute, Ball, Weld, Prismatic, Distance)
 
 
 def separation(joint: Any, so: ModuleType, a: Pose, b: Pose) -> Array:
-    """From anchor b to anchor a, (D, *batch) [m]."""
+    """Vector from anchor b to anchor a, (D, *batch) [m]."""
     return a.x + so.rotate(a.q, joint.anchor_a) - b.x - so.rotate(b.q, joint.anchor_b)
 
 
 def _turn(joint: Any, so: ModuleType, a: Pose, b: Pose) -> Array:
-    """Rotation of a against where it should be in b, (A, *batch) [rad] to first order."""
+    """Rotation of a from its nominal orientation in b, (A, *batch) [rad], to first order."""
     return so.sine(so.difference(joint.q, so.difference(b.q, a.q)))

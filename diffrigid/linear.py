@@ -1,4 +1,4 @@
-"""Matrices of the batch: products, and the solution of systems that are regular."""
+"""Matrices with batch axes: products, and the solution of regular systems."""
 
 import functools
 from collections.abc import Callable
@@ -12,15 +12,15 @@ from diffrigid.branches import opaque_true, unfused
 from diffrigid.gathers import MANY, fold
 from diffrigid.numerics import safe_divide
 
-TINY = 6  # rows of a matrix, up to which its elimination is written out
-SMALL = 9  # rows of a matrix, up to which all of a batch at once are faster than a library that takes one by one
+TINY = 6  # rows of a matrix, up to which its elimination is unrolled
+SMALL = 9  # rows of a matrix, up to which a whole batch at once is faster than a library that takes one by one
 
 
 def solve_regular(matrix: Array, right: Array) -> Array:
-    """x of matrix x = right, for regular matrices, (R, R, *batch), (R, *batch) -> (R, *batch).
+    """Solve matrix x = right for x, with regular matrices, (R, R, *batch), (R, *batch) -> (R, *batch).
 
-    Linear in `right`, also for transposition; without derivative by the matrix. Finite where a matrix is singular,
-    but no solution.
+    Linear in `right`, also for transposition; not differentiated with respect to the matrix. Where a matrix is singular
+    the result is finite, but no solution.
     """
     matrix = lax.stop_gradient(matrix)
 
@@ -37,7 +37,7 @@ def _eliminated(matrix: Array, right: Array) -> Array:
         return _written_out(system)
     if len(matrix) <= SMALL:
         return _gauss(system)
-    # By itself, for else all that the matrix is made of is computed in the order of the transposed one.
+    # Not fused, for else all that the matrix is made of is computed in the order of the transposed one.
     system = unfused(opaque_true(right), lambda system: system, system)
     # What elimination makes of the right side beside the matrix needs no permutation.
     upper, reduced = jnp.split(lax.linalg.lu(jnp.moveaxis(system, (0, 1), (-2, -1)))[0], [len(matrix)], axis=-1)
@@ -46,7 +46,7 @@ def _eliminated(matrix: Array, right: Array) -> Array:
 
 
 def matvec(matrix: Array, u: Array) -> Array:
-    """(R, R, *batch) times (R, *batch)."""
+    """Product of matrices (R, R, *batch) and vectors (R, *batch)."""
     parts = matrix * u[None]
     return fold(jnp.add, parts, 1) if len(u) <= MANY else parts.sum(1)
 
@@ -58,10 +58,10 @@ def identity(like: Array) -> Array:
 
 
 def _written_out(system: Array) -> Array:
-    """x of a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch), without a choice of pivots.
+    """Solve a system given as a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch), without pivoting.
 
-    No choice is needed where the matrix is the product of a block-diagonal one and one with a positive definite
-    symmetric part, as that of a body is but for strong friction. A direction whose pivot is 0 is left out.
+    Pivoting is not needed where the matrix is the product of a block-diagonal one and one with a positive definite
+    symmetric part, as that of a body is except for strong friction. A direction whose pivot is 0 is left out.
     """
     eliminated = []
     while len(system):
@@ -75,7 +75,7 @@ def _written_out(system: Array) -> Array:
 
 
 def _gauss(system: Array) -> Array:
-    """x of a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch).
+    """Solve a system given as a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch), with pivoting.
 
     Pivots are chosen by column in each matrix of the batch; rows stay where they are. A direction whose pivot is 0 is
     left out. Rows that had their turn are not touched again: cleared too (Gauss-Jordan) they leave residuals as large

@@ -1,6 +1,6 @@
-"""What keeps the joints of a world: forces, impulses and displacements from the errors of its joints.
+"""Forces, impulses and displacements that keep the joints of a world, from the errors of the joints.
 
-With J the Jacobian of all errors by the twists (dx, dtheta) of the bodies and M their mass matrix,
+With J the Jacobian of all errors with respect to the twists (dx, dtheta) of the bodies and M their mass matrix,
 
     J M^-1 J^T lam = -(J a + d(J)/dt v)      the forces J^T lam that keep the joints while bodies move freely
     J M^-1 J^T lam = -J v                    the impulses that bring velocities onto the joints
@@ -38,11 +38,11 @@ from diffrigid.numerics import dot
 from diffrigid.pytree import array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, rotations
 
-STRONGEST = 1.2  # [-] rate of damping times a step; several on one body add up, and with 2.8 the method is unstable
+STRONGEST = 1.2  # [-] rate of damping times a step; several on one body add up, and from 2.8 on Runge-Kutta is unstable
 
 
 def islands(ends: Iterable[tuple[int, int]], moving: int) -> tuple[tuple[int, ...], ...]:
-    """The bodies that hang together with each body by joints between such ends, itself included; moving bodies only."""
+    """Moving bodies connected with each moving body by joints with these ends, itself included."""
     together = [{body} for body in range(moving)]
     for a, b in ends:
         if a < moving and b < moving and together[a] is not together[b]:
@@ -70,7 +70,7 @@ class Linkage:
 
 
 def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> Linkage:
-    """Of the joints of a world at these poses (N, D, *batch), (N, Q, *batch)."""
+    """Linkage of the joints of a world at poses x (N, D, *batch), q (N, Q, *batch)."""
     so, ends = rotations(bodies.dim), ends_of(joints)
     groups, live = placed(joints, statics, x, q), opaque_true(x)
     inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q)
@@ -84,7 +84,7 @@ def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> 
 
 
 def _blocks(so: ModuleType, ends: tuple[tuple[int, int], ...], sides: Array, mass: Array, inertia: Array) -> Array:
-    """Of J M^-1 J^T, as `factorise` takes them: (n + pairs, E, E, *batch), from inverse masses and inertias."""
+    """Blocks of J M^-1 J^T for `factorise`, (n + pairs, E, E, *batch), from inverse masses and inertias."""
     moving, sides = len(mass), jnp.swapaxes(sides, 1, 2)
     inertia, mass = (to_sides(ends, leaf) for leaf in (inertia, mass))
 
@@ -101,7 +101,7 @@ def _blocks(so: ModuleType, ends: tuple[tuple[int, int], ...], sides: Array, mas
 
 @functools.cache
 def _shared(ends: tuple[tuple[int, int], ...], moving: int) -> tuple:
-    """Of each pair of coupled joints the sides on their common body, 2 i + s for side s of joint i; and on a second."""
+    """For each pair of coupled joints, indices 2 i + s (side s of joint i) on a shared body; a table per such body."""
     found = [
         [(2 * i + s, 2 * j + t) for s in (0, 1) for t in (0, 1) if ends[i][s] == ends[j][t] < moving]
         for i, j in plan(ends, moving).pairs
@@ -111,19 +111,19 @@ def _shared(ends: tuple[tuple[int, int], ...], moving: int) -> tuple:
 
 
 def to_sides(ends: tuple[tuple[int, int], ...], values: Array) -> Array:
-    """What bodies have (N, ...) at the two ends of every joint, (n, 2, ...); zeros of what stands still."""
+    """Gather values of the bodies (N, ...) at the two ends of every joint, (n, 2, ...); zeros for statics."""
     moving = len(values)
     return rows_or_zeros(values, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
 
 
 def _by_body(ends: tuple[tuple[int, int], ...], moving: int, by_sides: Array) -> Array:
-    """What both bodies of every joint get (n, 2, ...), summed over the joints of every moving body, (N, ...)."""
+    """Sum values for both bodies of every joint (n, 2, ...) over the joints of each moving body, (N, ...)."""
     return rows_or_zeros(by_sides.reshape(-1, *by_sides.shape[2:]), _sides_of(ends, moving)).sum(1)
 
 
 @functools.cache
 def _sides_of(ends: tuple[tuple[int, int], ...], moving: int) -> tuple[tuple[int, ...], ...]:
-    """For every moving body the sides of joints that are on it, padded by -1."""
+    """For each moving body, the sides 2 i + s of joints that are on it, padded by -1."""
     sides = [[2 * i + s for i, pair in enumerate(ends) for s in (0, 1) if pair[s] == body] for body in range(moving)]
     most = max(map(len, sides))
     return tuple(tuple(own + [-1] * (most - len(own))) for own in sides)
@@ -149,7 +149,7 @@ def _moved(link: Linkage, forces: Array) -> Array:
 
 
 def _multipliers(link: Linkage, target: Array) -> Array:
-    """lam of J M^-1 J^T lam = -target, for targets (n, E, *batch)."""
+    """Solve J M^-1 J^T lam = -target for lam, with targets (n, E, *batch)."""
 
     def product(lam: Array) -> Array:
         return _rates(link, _moved(link, _pull(link, lam)))
@@ -169,8 +169,8 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
 
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench, span: Array) -> Wrench:
-    """The forces of a world with those added that keep its joints, for an integration over span (*batch) [s]."""
-    state = unfused(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
+    """Forces of a world, with the constraint forces of its joints, for an integration over span (*batch) [s]."""
+    state = unfused(opaque_true(state.x), lambda state: state, state)  # else recomputed for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
     given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1), span)
@@ -186,12 +186,12 @@ def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wren
 
 
 def _twists(state: State) -> Array:
-    """(N, D + A, *batch)."""
+    """Twists (v, w) of all bodies, (N, D + A, *batch)."""
     return jnp.concatenate([state.v, state.w], axis=1)
 
 
 def _damped(joints: tuple, link: Linkage, twists: Array, forces: Array, span: Array) -> Array:
-    """Forces and torques on all bodies (N, D + A, *batch) with those added of the damping of joints."""
+    """Add the damping of joints to forces and torques on all bodies, (N, D + A, *batch)."""
     for group, at in zip(joints, link.groups, strict=True):
         if is_damped(group):
             forces = forces + _damping(group, at, link, twists, lambda rate: _resolved(rate * span))
@@ -204,10 +204,10 @@ def is_damped(group: Any) -> bool:
 
 
 def damped_later(joints: tuple, link: Linkage, twists: Array, momentum: Array, later: Array) -> Array:
-    """Momentum of all bodies (N, D + A, *batch), that gave them `twists`, after the damping of joints took of it.
+    """Momenta of all bodies (N, D + A, *batch), which gave them `twists`, after joints have damped them for a time.
 
     Args:
-        later: (N, *batch) [s] for which damping has acted since, alike for bodies that hang together.
+        later: (N, *batch) [s] time for which damping has acted since, equal for connected bodies.
     """
     span, taken = later.max(0), jnp.zeros_like(momentum)
 
@@ -225,7 +225,7 @@ def _damping(group: Any, at: PlacedJoints, link: Linkage, twists: Array, share: 
     """Forces and torques on all bodies (N, D + A, *batch) by the damping of a group of joints.
 
     Args:
-        share: of a damping that counts, by the rate [1/s] at which it alone would slow its joint.
+        share: function of the rate [1/s] at which a damping alone would slow its joint: the fraction of it that counts.
     """
     so, ends = rotations(at.a.x.shape[1]), ends_of((group,))
 
@@ -241,10 +241,10 @@ def _damping(group: Any, at: PlacedJoints, link: Linkage, twists: Array, share: 
 
 
 def _resolved(steps: Array) -> Array:
-    """The share of a damping, by its rate times the length of a step, that Runge-Kutta can integrate, (*batch).
+    """Fraction of a damping that Runge-Kutta can integrate, (*batch), by its rate times the length of a step, `steps`.
 
-    All of it, to a smaller error than that of the method, until it acts within about a step, STRONGEST; and no more:
-    a joint that is damped a thousand times as much would be thrown about, and is stopped within some steps instead.
+    All of it, to a smaller error than that of the method, until it acts within about a step, STRONGEST; beyond that no
+    more: a joint that is damped a thousand times as much would be unstable, and is stopped within some steps instead.
     """
     ratio = steps / STRONGEST
     large = ratio > 1.0
@@ -253,9 +253,9 @@ def _resolved(steps: Array) -> Array:
 
 
 def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> State:
-    """The state with poses and velocities brought onto the joints, by what joints can do: J^T lam, and no more.
+    """Project the poses and velocities of a state onto the joints, along J^T lam, as joints act, and no more.
 
-    Both by J at the poses as they come, so that the velocities are then on the joints up to the displacement.
+    Both use J at the poses before, so the velocities then satisfy the joints up to the effect of the displacement.
     """
     state = unfused(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)

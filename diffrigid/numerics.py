@@ -6,7 +6,7 @@ because reverse mode multiplies the derivative of the branch not taken by zero, 
 Vectors carry their components on the leading axis, `(D, *batch)`.
 
 Functions called in many places are jitted, here and elsewhere, so that JAX traces, differentiates and transposes them
-once; XLA inlines them. Tracing a gradient takes a quarter less time.
+once, which shortens the tracing of a gradient; XLA inlines them.
 """
 
 import functools
@@ -20,12 +20,12 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
-FOUND = "found"  # name of what searches and iterations arrive at: reverse mode saves it, and nothing else of a pass
-PASSED = "passed"  # of what a pass hands on to the next; with both, no step is computed again
+FOUND = "found"  # names results of searches and iterations: reverse mode saves these, and nothing else of a pass
+PASSED = "passed"  # names what a pass hands on to the next; with both saved, no step is recomputed
 
 
 def saving(*names: str) -> Callable[[Callable], Callable]:
-    """Decorator of a loop's or branch's body: reverse mode saves what has these names, and computes the rest again."""
+    """Decorator of a loop's or branch's body: reverse mode saves what has these names, and recomputes the rest."""
     policy = jax.checkpoint_policies.save_only_these_names(*names)
     return functools.partial(jax.checkpoint, prevent_cse=False, policy=policy)
 
@@ -63,8 +63,8 @@ def unit_vector(like: Array, axis: int) -> Array:
 def components(*parts: Array) -> Array:
     """Numbers (*batch) as the components of a vector, (D, *batch).
 
-    By `lax.select` and not `jnp.stack`: on a CPU XLA does not vectorise loops that concatenate, and a cross product
-    took ten times as long.
+    By `lax.select` and not `jnp.stack`: on a CPU XLA does not vectorise loops that concatenate, which makes cross
+    products much slower.
     """
     alike = parts if all(part.shape == parts[0].shape for part in parts) else jnp.broadcast_arrays(*parts)
     shape, across = (len(parts), *alike[0].shape), tuple(range(1, alike[0].ndim + 1))
@@ -78,10 +78,10 @@ def components(*parts: Array) -> Array:
 
 @jax.custom_jvp
 def with_tangents(tree: Any, by: Any) -> Any:
-    """`tree` itself, all of whose leaves have a tangent as soon as one of its own or of `by` has.
+    """Return `tree`, with tangents for all its leaves as soon as one of them or of `by` has a tangent.
 
-    Forward mode traces the body of a loop again until it knows which parts of what is carried have a tangent. So
-    that each has one from the beginning: the gradient of three colliding discs is traced in 5.1 CPU-s instead of 6.2.
+    Forward mode traces the body of a loop again until it knows which parts of its carry have a tangent. With this each
+    has one from the beginning, which shortens tracing.
     """
     del by
     return tree
@@ -93,13 +93,13 @@ def _with_tangents_jvp(primals, tangents):
 
 
 def _least(like: Array) -> float:
-    """Numbers below it have lost digits, and may or may not be taken as zero: then 0 * inf is NaN, as at zero."""
+    """Smallest normal number: below it digits are lost, and a number may be taken as zero; then 0 * inf is NaN."""
     return float(jnp.finfo(like.dtype).tiny)
 
 
 @jax.jit
 def safe_sqrt(x: Array) -> Array:
-    """Square root, 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite), or next to it.
+    """Square root; 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite), or just above.
 
     Two results of one program that both need x may each have a copy of it, which XLA rounds differently: 0 in one,
     1e-17 in the other. What stands in for an x that is not positive has to be tiny: else the root of one copy would
@@ -114,9 +114,9 @@ def safe_sqrt(x: Array) -> Array:
 def cos_sin(phi: Array) -> tuple[Array, Array]:
     """Cosine and sine, to rounding for |phi| up to some thousand turns.
 
-    XLA calls the scalar library for them on a CPU, which was a third of the time of a step of a bouncing disc.
-    Reduction to |r| <= pi / 2 in three parts of pi (Cody & Waite 1980), then Taylor's series, by Horner's rule, which
-    there is below rounding after twelve terms (single precision: seven).
+    XLA calls the scalar library for them on a CPU, which is slow. Reduction to |r| <= pi / 2 in three parts of pi
+    (Cody & Waite 1980), then Taylor's series by Horner's rule, whose remainder there is below rounding after twelve
+    terms (single precision: seven).
     """
     halves = jnp.round(phi * (1.0 / np.pi))
     r = phi
@@ -156,7 +156,7 @@ _PI = {
 
 @jax.jit
 def safe_divide(a: Array, b: Array) -> Array:
-    """a / b of a finite a, and 0 with zero derivative where b == 0 (0 / 0 in both modes), or next to it."""
+    """a / b for a finite a; 0 with zero derivative where b == 0 (0 / 0 in both modes), or nearly so."""
     return _quotient(a, jnp.where(jnp.abs(b) >= _least(b), b, jnp.inf))
 
 
@@ -225,7 +225,7 @@ def _implicit_root_jvp(primals, tangents):
 
 @jax.custom_jvp
 def _once(slope: Array, error: Array) -> Array:
-    """The slope, for a first derivative only."""
+    """The slope, which can be differentiated no further."""
     del error
     return slope
 

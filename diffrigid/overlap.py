@@ -1,4 +1,4 @@
-"""Which bodies overlap: the exact signed distance of two rounded convex shapes, in NumPy, for known scenes.
+"""Overlap of bodies: the exact signed distance of two rounded convex shapes, in NumPy, for known scenes.
 
 The distance of two convex cores is the largest separation along any direction, and the largest is found along
 one of finitely many: normals of faces, perpendiculars of two edges or of an edge and a vertex, lines through
@@ -26,14 +26,14 @@ class Outline(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Radius about the mean corner that holds it [m]."""
+        """Radius [m] about the mean corner that encloses it."""
         if self.normal is not None:
             return np.inf
         return np.linalg.norm(self.corners - self.corners.mean(0), axis=1).max() + self.rounding
 
 
 def place(shape: Any, x: np.ndarray, q: np.ndarray, center: np.ndarray) -> Outline:
-    """A shape of which the point `center` is at x (D,) [m], with orientation q."""
+    """Outline of a shape whose point `center` is at x (D,) [m], with orientation q."""
     dim = len(x)
     x = x - rotated(q, np.asarray(center))
     if isinstance(shape, HalfSpace):
@@ -76,14 +76,14 @@ def _directions(a: Outline, b: Outline) -> np.ndarray:
 
 
 def _across(a: Outline, b: Outline) -> np.ndarray:
-    """From each edge of b to each corner of a, at right angles to the edge."""
+    """Vectors from each edge of b to each corner of a, perpendicular to the edge."""
     to = a.corners[:, None] - b.starts[None]
     share = (to * b.sides).sum(2) / (b.sides**2).sum(1)
     return (to - share[:, :, None] * b.sides).reshape(-1, 3)
 
 
 def overlapping(colliders: dict[int, Outline], pairs: list, margin: float) -> list[tuple[int, int]]:
-    """Those pairs (i, j) of keys of `colliders` that penetrate by more than `margin` of the smaller size."""
+    """Pairs (i, j) of keys of `colliders` that penetrate by more than `margin` of the smaller size."""
     size = {key: collider.size for key, collider in colliders.items()}
     centre = {key: collider.corners.mean(0) for key, collider in colliders.items()}
     deep = []
@@ -95,9 +95,9 @@ def overlapping(colliders: dict[int, Outline], pairs: list, margin: float) -> li
 
 
 def near_pairs(colliders: dict[int, Outline], moving: int) -> list[tuple[int, int]]:
-    """All pairs that may overlap: round ones in one cell of a grid, or in two that touch, and those with half-spaces.
+    """All pairs that may overlap: bounded ones in the same or adjacent cells of a grid, and those with half-spaces.
 
-    The first of each is below `moving`.
+    The first of each pair is below `moving`.
     """
     round_ones = {key: collider for key, collider in colliders.items() if collider.normal is None}
     pairs = [(i, j) for i in round_ones if i < moving for j in colliders if j not in round_ones]

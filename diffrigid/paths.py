@@ -4,7 +4,7 @@ restitution, friction, ..., gravity      a coefficient of all bodies and statics
 contact.width, contact.rest_speed        numbers of the contact model
 FORCE.field                              a force of the scene, by its name: "drag.linear"
 JOINT.field                              a joint of the scene, by its name: "revolute.anchor_a"
-JOINT.angle | rate, JOINT.translation | rate    initial state of a hinge, of a slider, with all that hangs on it
+JOINT.angle | rate, JOINT.translation | rate    initial state of a hinge, of a slider, and of all attached to it
 BODY.mass | inertia | restitution | friction | ... | shape.FIELD
 BODY.density                             of a body that is solid: sets its mass, and its inertia by its shape
 BODY.x | v | q | w | angle               initial state (angle: 2D)
@@ -49,19 +49,19 @@ ALONG_AXIS = {"lower": "m", "upper": "m", "rate": "m/s", "speed": "m/s", "fricti
 
 
 class Place(NamedTuple):
-    """A leaf and the row of it that a path names. Chain: attribute names and tuple indices from (world, state)."""
+    """The leaf that a path names, and the row of it. Chain: attribute names and tuple indices from (world, state)."""
 
     chain: tuple[str | int, ...]
     row: int | None  # None: all of it
     angle: bool = False  # the leaf is q, the value an angle
-    joint: tuple[str, str] | None = None  # name and "angle", "translation" or "rate": the leaf is part of what moves
+    joint: tuple[str, str] | None = None  # name and "angle", "translation" or "rate": the leaf moves with the joint
     shape: tuple[int, int] | None = None  # group and row of a shape: the value is its density
 
 
 def read(world: World, state: State, path: str) -> Array:
     """Value of a parameter, without batch axes: shape () or (D,) or as its leaf has it.
 
-    Of a coefficient without the name of a body, such as "restitution", that of the first body.
+    A coefficient without the name of a body, such as "restitution", gives that of the first body.
 
     Example:
         >>> dr.paths.read(world, state, "ball.x").tolist()
@@ -87,7 +87,7 @@ def read(world: World, state: State, path: str) -> Array:
 def write(world: World, state: State, path: str, value: Any) -> tuple[World, State]:
     """World and state with a parameter changed; everything else shared. Works on traced values.
 
-    They are taken as they are: a normal, an axis or a quaternion has to have length one.
+    Values are not normalised: a normal, an axis or a quaternion has to have length one.
 
     Raises:
         ValueError: there is no such parameter, or the value has another shape. Coefficients without the name of a
@@ -129,7 +129,7 @@ def unit(world: World, path: str) -> str:
 
 
 def places(world: World, path: str) -> list[Place]:
-    """The leaves that a path names; of a component those of the whole vector.
+    """The leaves that a path names; for a component, those of the whole vector.
 
     Raises:
         ValueError: there is no such parameter; the message lists the nearest.
@@ -141,7 +141,7 @@ def places(world: World, path: str) -> list[Place]:
 
 
 def order_of(world: World, path: str) -> int:
-    """When to set a parameter beside others: shapes before densities, all before joints, and their rates last."""
+    """Rank in which to set a parameter: shapes before densities, all before joints, and their rates last."""
     known = catalogue(world).get(component(path)[0], [])
     place = known[0] if known else Place((), None)
     return (2 + (place.joint[1] == joint_motion.RATE)) if place.joint else int(place.shape is not None)
@@ -154,7 +154,7 @@ def _solid(world: World, group: int, row: int) -> tuple[Array, Array]:
 
 
 def hint(world: World, path: str, known: Iterable[str]) -> str:
-    """What was meant by a path that is none of those known."""
+    """Hint on what was meant by a path that is not `known`."""
     owner, _, field = path.rpartition(".")
     joints = [(name, group) for names, group in zip(world.joint_names, world.joints, strict=True) for name in names]
     owners: dict[str, Any] = dict(zip(world.force_names, world.forces, strict=True)) | dict(joints)
@@ -173,14 +173,14 @@ def component(path: str) -> tuple[str, int | None]:
 
 
 def _item(vector: Array, path: str, index: int) -> Array:
-    """A number of a vector, by the path of the whole."""
+    """Component `index` of a vector; `path` is that of the whole."""
     if not vector.ndim or index >= vector.shape[0]:
         raise ValueError(f"{path}[{index}] is no number: {path} has the shape {vector.shape}.")
     return _row(vector, index)
 
 
 def catalogue(world: World) -> dict[str, list[Place]]:
-    """Every path of a world, and what it stands for.
+    """Every path of a world, and the places it stands for.
 
     Example:
         >>> [path for path in dr.paths.catalogue(world) if path.startswith("ball.") and "shape" in path]
@@ -252,12 +252,12 @@ def _set(record: Any, field: str, place: Place, path: str, value: Any) -> Array:
 
 
 def _row(leaf: Array, row: int) -> Array:
-    """One row of a leaf; of a known one without compiling anything."""
+    """One row of a leaf; without compiling anything if the leaf is known."""
     return leaf[row] if traced(leaf) else jax.device_put(np.asarray(leaf)[row])
 
 
 def _with_rows(leaf: Array, rows: Any, value: Numbers) -> Array:
-    """A leaf with some rows changed; a known one without compiling anything."""
+    """A leaf with some rows changed; without compiling anything if the leaf is known."""
     if traced((leaf, value)):
         return jnp.asarray(leaf).at[rows].set(value)
     changed = np.array(leaf)

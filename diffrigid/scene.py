@@ -1,4 +1,4 @@
-"""`scene`: from bodies as a user writes them to `(World, State)`. All checks of values are made here."""
+"""`scene`: from bodies as users write them to `(World, State)`. All checks of values are made here."""
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -45,7 +45,7 @@ RESERVED = (*COEFFICIENTS, "contact")  # paths, or the first part of one; and "g
 
 @dataclass(frozen=True)
 class Body:
-    """A moving body, at its start.
+    """A moving body, and its initial state.
 
     Args:
         shape: a shape, or None for a body without geometry, which needs `mass` and `inertia`.
@@ -116,14 +116,14 @@ def scene(
     joints: Sequence | Mapping = (),
     ignore: Sequence[tuple[str, str]] = (),
 ) -> tuple[World, State]:
-    """World and initial state from named bodies.
+    """Make a world and its initial state from named bodies.
 
     Args:
         gravity: (D,) [m/s^2]; None: none.
         restitution, friction: [-] of every body and static that does not set its own. A contact takes the
             mean of its two sides, or the one that was set if only one was.
-        restitution_falloff: [s/m] of c in e = restitution (1 + c u)^(-1/4), u the speed of the impact; None: constant.
-        rolling_friction, spinning_friction: [m] the most torque per normal force, against rolling and, in 3D, against
+        restitution_falloff: [s/m] c in e = restitution (1 + c u)^(-1/4), u the speed of the impact; None: constant.
+        rolling_friction, spinning_friction: [m] largest torque per normal force, against rolling and, in 3D, against
             spinning about the normal; None: none. Mixed as restitution is.
         contact: the contact model; default `Contact()`, exact impacts.
         forces: records from `diffrigid.forces`, in a sequence or by name; a name is what a path to it starts
@@ -257,7 +257,7 @@ def _state(moving: Mapping[str, Body], dim: int) -> State:
 
 
 def _looking_around(shapes: Mapping[str, Any], moving: Mapping[str, Body]) -> dict[str, Any]:
-    """The height fields, with how many cells the bodies look around."""
+    """Height fields with `cells` filled in: how far to each side the bodies look."""
     found = {}
     for name, shape in shapes.items():
         if not isinstance(shape, HeightField):
@@ -277,7 +277,7 @@ def _looking_around(shapes: Mapping[str, Any], moving: Mapping[str, Body]) -> di
 
 
 def _stack_shapes(shapes: Mapping[str, Any], solids: Mapping[str, Solid | None], dim: int):
-    """Shapes of one kind (type and static fields) in one record each, their offsets, and their owners.
+    """Stack the shapes of each kind (type and static fields) in one record; with their offsets and owners.
 
     A moving shape sits with its centre of mass, a static one with its origin, on the collider.
     """
@@ -298,7 +298,7 @@ def _stack_shapes(shapes: Mapping[str, Any], solids: Mapping[str, Solid | None],
 
 
 def _count(shape_a: Any, shape_b: Any, dim: int) -> int:
-    """Contacts that the pair function returns for these two kinds of shapes."""
+    """Number of contacts that the pair function returns for these two kinds of shapes."""
     x, q = np.zeros(dim, jnp.result_type(float)), np.zeros(2 if dim == 2 else 4, jnp.result_type(float))
     a, b = (jax.tree.map(lambda leaf: leaf[0], shape) for shape in (shape_a, shape_b))
     contacts = jax.eval_shape(COLLIDERS[type(a), type(b)], a, x, q, b, x, q)
@@ -343,7 +343,7 @@ def _contact(contact: Any) -> Contact:
 
 
 def _warn_of_overlap(world: World, state: State, shapes: Mapping, solids: Mapping) -> None:
-    """Warn of pairs that penetrate at the start; those with uneven ground or a traced value are left out."""
+    """Warn of pairs that penetrate at the start, except those with uneven ground or a traced value."""
     poses = [*zip(state.x, state.q, strict=True), *zip(world.statics.x, world.statics.q, strict=True)]
     placed = {}
     for index, ((name, shape), (x, q)) in enumerate(zip(shapes.items(), poses, strict=True)):

@@ -70,7 +70,7 @@ LOSSES: dict[str, Callable] = {"squares": sysid.squares, "huber": sysid.huber, "
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a file holds."""
+    """Content of a scene file."""
 
     world: World
     state: State
@@ -81,7 +81,7 @@ class SceneFile:
 
 
 def read_scene(path: str | Path) -> SceneFile:
-    """The scene of a file, and what is to be fitted in it.
+    """Read the scene of a file, and the free parameters of it.
 
     Raises:
         ValueError: names the file, the table and the key, what was expected, and the nearest name.
@@ -119,7 +119,7 @@ def read_scene(path: str | Path) -> SceneFile:
 
 
 def _column(where: str, entry: Any) -> tuple[str, float]:
-    """From "name", or { name = factor }."""
+    """Parse "name", or { name = factor }."""
     given = {entry: 1.0} if isinstance(entry, str) else entry
     if not isinstance(given, Mapping) or [isinstance(factor, int | float) for factor in given.values()] != [True]:
         raise ValueError(f"{where} is {entry!r}: expected the name of a column, or {{ name = factor }}")
@@ -136,7 +136,7 @@ def _body(where: str, kind: Any, entry: Any) -> Any:
 
 
 def _one_of(where: str, kinds: Mapping[str, Callable], entry: Any) -> Any:
-    """A record from { kind = { field = value } }."""
+    """Make a record from { kind = { field = value } }."""
     if not isinstance(entry, Mapping) or len(entry) != 1:
         raise ValueError(
             f"{where} is {entry!r}: expected one kind and its fields, such as {{ {next(iter(kinds))} = {{ }} }}"
@@ -171,7 +171,7 @@ def _options(where: str, entries: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _kind(where: str, entry: Any) -> Any:
-    """A kind of free parameter, which `each` and `prior` take in."""
+    """Make a kind of free parameter, which may be wrapped by `each` or `prior`."""
     if isinstance(entry, Mapping) and set(entry) == {"each"}:
         return sysid.each(_kind(where, entry["each"]))
     if isinstance(entry, Mapping) and set(entry) == {"prior"}:
@@ -183,7 +183,7 @@ def _kind(where: str, entry: Any) -> Any:
 
 
 def _named(where: str, kinds: Mapping[str, Callable], entry: Any) -> Any:
-    """What a name alone, or { name = arguments }, stands for."""
+    """Make what a name alone, or { name = arguments }, stands for."""
     if not isinstance(entry, str) and not (isinstance(entry, Mapping) and len(entry) == 1):
         raise ValueError(
             f"{where} is {entry!r}: expected one kind, a name or {{ name = arguments }}: {', '.join(kinds)}"
@@ -198,7 +198,7 @@ def _named(where: str, kinds: Mapping[str, Callable], entry: Any) -> Any:
 
 
 def _observer(where: str, entry: Any) -> Any:
-    """An observer, others that it is of among its fields."""
+    """Make an observer, with others among its fields."""
     if isinstance(entry, str):
         return entry
     if isinstance(entry, Mapping) and len(entry) == 1 and isinstance(fields := next(iter(entry.values())), Mapping):

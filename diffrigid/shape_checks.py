@@ -1,4 +1,4 @@
-"""Checks of shapes as a user gives them: each message names the leaf, what was expected, and the fix."""
+"""Checks of shapes given by users: each message names the leaf, what was expected, and the fix."""
 
 import math
 
@@ -26,7 +26,7 @@ from diffrigid.shapes import (
 
 
 def check_shape(shape: Shape, where: str) -> None:
-    """Raise ValueError if the shape is not one, naming the leaf as `where.field`.
+    """Raise ValueError if the shape is not valid, naming the leaf as `where.field`.
 
     Ranks and lengths are always checked; values only where they are concrete.
     """
@@ -52,7 +52,7 @@ def check_shape(shape: Shape, where: str) -> None:
 
 
 def _check_axes(leaf, letters, path, dim):
-    """Raise ValueError unless the shape of `leaf` is what `letters` ask for in one world."""
+    """Raise ValueError unless the shape of `leaf` is that of `letters` in one world."""
     try:
         shape = numbers(path, leaf, None, finite=False).shape
     except (TypeError, ValueError) as error:

@@ -158,7 +158,7 @@ class HeightField:
 
     heights: Leaf = array("R", "C")  # (R, C, *batch) [m], R and C >= 2
     spacing: Leaf = array()  # (*batch) [m] > 0
-    cells: int | None = static(None)  # how far to each side a body looks, in cells; `scene` finds it from known sizes
+    cells: int | None = static(None)  # how far to each side a body looks, in cells; None: `scene` finds it, if it can
 
 
 SHAPES = (Disc, Sphere, Box, Capsule, Polygon, Hull, HalfSpace, Profile, HeightField)
@@ -168,7 +168,7 @@ UNEVEN = (Profile, HeightField)  # solids that are not convex
 
 
 def dimension(shape: Shape) -> int | None:
-    """Dimension of the space a shape lives in, 2 or 3; None for a capsule, which lives in either."""
+    """Dimension of a shape, 2 or 3; None for a capsule, which may have either."""
     match shape:
         case Disc() | Polygon() | Profile():
             return 2
@@ -287,7 +287,7 @@ def _moments(shape, dim):
 
 
 def _centred(volume, spread):
-    """Moments of a shape with its centre at the origin and mean squares `spread`, (D,) [m^2], of x, y, z."""
+    """Moments of a shape with its centre at the origin and mean squares of x, y, z `spread`, (D,) [m^2]."""
     return volume, jnp.zeros_like(spread), spread[:, None] * np.eye(len(spread), dtype=spread.dtype)
 
 
@@ -357,7 +357,7 @@ def _topology(hull: Hull) -> tuple[tuple, tuple]:
 
 
 def traced(leaf) -> bool:
-    """Whether a leaf, or a number in a tuple given for one, is known only when the program runs."""
+    """Whether a leaf, or a number in a tuple given for one, is a tracer, known only when the program runs."""
     return any(isinstance(part, jax.core.Tracer) for part in jax.tree.leaves(leaf))
 
 

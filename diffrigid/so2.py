@@ -16,25 +16,25 @@ D, A, Q = 2, 1, 2  # components of a vector, of an angular velocity, of an orien
 
 
 def perp(r: Array) -> Array:
-    """r turned by a quarter, (-y, x). By reversal, because XLA does not vectorise loops that stack components."""
+    """Turn r by a quarter turn, (-y, x). By reversal, because XLA does not vectorise loops that stack components."""
     sign = 2.0 * lax.broadcasted_iota(r.dtype, r.shape, 0) - 1.0
     return sign * r[::-1]
 
 
 @jax.jit
 def rotate(q: Array, r: Array) -> Array:
-    """Body axes to world axes."""
+    """Rotate r from body axes to world axes."""
     return q[:1] * r + q[1:] * perp(r)
 
 
 @jax.jit
 def unrotate(q: Array, r: Array) -> Array:
-    """World axes to body axes."""
+    """Rotate r from world axes to body axes."""
     return q[:1] * r - q[1:] * perp(r)
 
 
 def compose(q: Array, p: Array) -> Array:
-    """First p, then q; brought back to unit length, so that rounding does not accumulate."""
+    """Rotation p followed by q, brought back to unit length, so that rounding does not accumulate."""
     return _unit_product(q, p)
 
 
@@ -44,17 +44,17 @@ def exp(phi: Array) -> Array:
 
 
 def turn_by(phi: Array, q: Array) -> Array:
-    """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
+    """Turn q by the rotation vector phi in world axes, (A, *batch) [rad]."""
     return _unit_product(q, cos_sin(phi[0]))
 
 
 def turn_in_body(q: Array, phi: Array) -> Array:
-    """q turned further by the rotation vector phi in body axes: the same in the plane."""
+    """Turn q by the rotation vector phi in body axes: the same as `turn_by` in the plane."""
     return _unit_product(q, cos_sin(phi[0]))
 
 
 def _unit_product(q: Any, p: Any) -> Array:
-    """Product of complex numbers. XLA would compute a vector again for each component that is picked from it."""
+    """Product of unit complex numbers. XLA would recompute a vector for each component that is picked from it."""
     (a, b), (c, s) = q, p
     x, y = a * c - b * s, a * s + b * c
     # One Newton step for 1 / |product| about 1: exact to rounding for products of unit vectors.
@@ -122,24 +122,24 @@ def turn_series(inverse: Array, q: Array, L: Array, tau: Array | None) -> Array:
 
 
 def free_turn(inverse: Array, q: Array, L: Array, span: Array) -> tuple[None, Array]:
-    """`turn_series` without a torque. In space there is what carries the body as well."""
+    """`turn_series` without a torque. The first result, which carries the body in 3D, is None here."""
     del span
     return None, turn_series(inverse, q, L, None)
 
 
 def turn_rate(phi: Array, w: Array) -> Array:
-    """Rate of the rotation vector phi since q0 where the body turns with w in its own axes, (1, *batch) [rad/s]."""
+    """Rate of the rotation vector phi for an angular velocity w in body axes, (1, *batch) [rad/s]."""
     del phi
     return w
 
 
 def rate(w: Array, q: Array) -> Array:
-    """dq/dt of a body that turns with w in world axes, (2, *batch) [1/s]."""
+    """dq/dt for an angular velocity w in world axes, (2, *batch) [1/s]."""
     return w * perp(q)
 
 
 def difference(q: Array, p: Array) -> Array:
-    """p as seen from q: the rotation after which q brings to p."""
+    """Orientation p in the axes of q, q^-1 o p."""
     return unrotate(q, p)
 
 
@@ -149,12 +149,12 @@ def sine(q: Array) -> Array:
 
 
 def gyroscopic(inertia: Array, q: Array, w: Array) -> Array:
-    """w x L, (1, *batch) [N m]: none in the plane."""
+    """w x L, (1, *batch) [N m]: zero in the plane."""
     del inertia, q
     return jnp.zeros_like(w)
 
 
 def precession(L: Array, w: Array) -> Array:
-    """I dw of a free body, (1, *batch) [N m]: none in the plane."""
+    """I dw of a free body, (1, *batch) [N m]: zero in the plane."""
     del L
     return jnp.zeros_like(w)

@@ -19,7 +19,7 @@ from diffrigid.so3_whole import whole
 
 D, A, Q = 3, 3, 4  # components of a vector, of an angular velocity, of an orientation
 SERIES_ORDER = 6  # of the free rotation within a step; see turn_series
-RESOLVED = 2.0  # [rad] of a turn within a step that the series resolves; see free_turn
+RESOLVED = 2.0  # [rad] largest turn within a step that the series resolves; see free_turn
 
 
 @jax.jit
@@ -36,7 +36,7 @@ moment = cross  # r x F: torque of a force F at r
 @jax.jit
 @whole(so3_whole.rotate, 1, 1)
 def rotate(q: Array, r: Array) -> Array:
-    """Body axes to world axes: r + 2 s (u x r) + 2 u x (u x r)."""
+    """Rotate r from body axes to world axes: r + 2 s (u x r) + 2 u x (u x r)."""
     s, x, y, z = q
     return components(*_rotated(s, x, y, z, r))
 
@@ -51,14 +51,14 @@ def _rotated(s: Array, x: Array, y: Array, z: Array, r: Any) -> list[Array]:
 @jax.jit
 @whole(so3_whole.unrotate, 1, 1)
 def unrotate(q: Array, r: Array) -> Array:
-    """World axes to body axes."""
+    """Rotate r from world axes to body axes."""
     s, x, y, z = q
     return components(*_rotated(-s, x, y, z, r))
 
 
 @whole(so3_whole.compose, 1, 1)
 def compose(q: Array, p: Array) -> Array:
-    """First p, then q; brought back to unit length, so that rounding does not accumulate."""
+    """Rotation p followed by q, brought back to unit length, so that rounding does not accumulate."""
     return _unit_product(q, p)
 
 
@@ -70,18 +70,18 @@ def exp(phi: Array) -> Array:
 
 @whole(so3_whole.turn_by, 1, 1)
 def turn_by(phi: Array, q: Array) -> Array:
-    """q turned further by the rotation vector phi in world axes, (A, *batch) [rad]."""
+    """Turn q by the rotation vector phi in world axes, (A, *batch) [rad]."""
     return _unit_product(_exp(phi), q)
 
 
 @whole(so3_whole.turn_in_body, 1, 1)
 def turn_in_body(q: Array, phi: Array) -> Array:
-    """q turned further by the rotation vector phi in body axes, (A, *batch) [rad]."""
+    """Turn q by the rotation vector phi in body axes, (A, *batch) [rad]."""
     return _unit_product(q, _exp(phi))
 
 
 def _exp(phi: Array) -> list[Array]:
-    """Components of the quaternion. XLA would compute a vector again for each component that is picked from it."""
+    """Components of the quaternion `exp`. XLA would recompute a vector for each component that is picked from it."""
     x, y, z = phi
     s, scale = half_turn(x * x + y * y + z * z)
     return [s, scale * x, scale * y, scale * z]
@@ -121,7 +121,7 @@ def log(q: Array) -> Array:
 @jax.jit
 @whole(so3_whole.matrix_product, 2, 1)
 def matrix_product(m: Array, r: Array) -> Array:
-    """(3, 3, *batch) times (3, *batch)."""
+    """Product of a matrix (3, 3, *batch) and a vector (3, *batch)."""
     return components(*_product_of_rows(_entries(m), r))
 
 
@@ -150,7 +150,7 @@ def _matrix(q: Array) -> list[list[Array]]:
 def inverse_inertia(inertia: Array) -> Array:
     """Inverse of a symmetric (3, 3, *batch) matrix by cofactors, [1/(kg m^2)]."""
     trace = lax.stop_gradient(_trace(inertia))[None, None]
-    a, b, c = inertia / trace  # of any unit: the square of a determinant may underflow
+    a, b, c = inertia / trace  # normalised: the square of a determinant may underflow
     bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
     return jnp.stack([bc, ca, ab], axis=1) / dot(a, bc)[None, None] / trace
 
@@ -189,12 +189,12 @@ def mobility(inverse: Array, r: Array, mid: Array) -> Array:
 
 @jax.custom_jvp
 def free_turn(inverse: Array, q: Array, L: Array, span: Array) -> tuple[Array, Array]:
-    """Free rotation through a step of length span (*batch) [s]: what carries the body, and what it turns in its axes.
+    """Free rotation through a step of length span (*batch) [s]: a rotation of the world axes, and one in body axes.
 
     After time s the orientation is exp(carry s) o q o exp(sum_k turn[k] s^(k+1)), with carry (3, *batch) [rad/s] in
     world axes and turn (K, 3, *batch) in body axes. L is kept exactly because it is not integrated at all.
 
-    With l = R^T L and any number c, a body of inverse inertia I^-1 is carried by c L, and turns within by
+    With l = R^T L and any number c, a body of inverse inertia I^-1 is carried by c L, and turns in its own axes by
     u = (I^-1 - c) l, because in Euler's equations l' = l x w the part along l has no effect. With 1/c between the two
     moments that differ least, u is the spin of a symmetric top about its axis e, constant, and the whole is exact
     (Goldstein, Classical Mechanics, section 5.6). Else it is `turn_series` of u, with an error of (u s)^7 / 5040.
@@ -223,7 +223,7 @@ def _free_turn_jvp(primals, tangents):
 
 
 def _as_top(inverse: Array, q: Array, L: Array, span: Array) -> tuple[Array, Array]:
-    """`free_turn` of bodies of any inertia."""
+    """`free_turn` for bodies of any inertia."""
     e, l = _odd_axis(lax.stop_gradient(inverse)), unrotate(q, L)
     about = dot(e, matrix_product(inverse, e))
     c = 0.5 * (_trace(inverse) - about)
@@ -237,7 +237,7 @@ def _as_top(inverse: Array, q: Array, L: Array, span: Array) -> tuple[Array, Arr
 
 
 def _most_turn(rest: Array, k: Array, l: Array) -> Array:
-    """Bound of |u|^2, (*batch), wherever u = rest l wanders: by what does not change.
+    """Bound of |u|^2, (*batch), however u = rest l moves, from quantities that are conserved.
 
     rest has the eigenvalues k, d and -d, so that u = (k l1, d l2, -d l3), |u|^2 = k (k l1^2) + d^2 (l2^2 + l3^2), and
     l . u = k l1^2 + d (l2^2 - l3^2) is constant, as E and |l| are.
@@ -271,7 +271,7 @@ def _odd_axis(inverse: Array) -> Array:
 
 @jax.custom_jvp
 def carried(phi: Array, q: Array) -> Array:
-    """`turn_by`, but where all of phi is zero, as for balls and cubes in free flight, q is not computed again."""
+    """`turn_by`, which returns q as it is where all of phi is zero, as for balls and cubes in free flight."""
     return lax.cond(any_world(phi != 0), turn_by, lambda _, q: q, phi, q)
 
 
@@ -324,7 +324,7 @@ def _coefficient(a: Array, b: Array, n: Array) -> Array:
 
 
 def turn_rate(phi: Array, w: Array) -> Array:
-    """Rate of the rotation vector phi since q0, q = q0 o exp(phi), where the body turns with w in its own axes.
+    """Rate of the rotation vector phi, with q = q0 o exp(phi), for an angular velocity w in body axes.
 
     (3, *batch) [rad/s], to fourth order in phi: the inverse right Jacobian, as in `turn_series`.
     """
@@ -334,13 +334,13 @@ def turn_rate(phi: Array, w: Array) -> Array:
 
 @whole(so3_whole.rate, 1, 1)
 def rate(w: Array, q: Array) -> Array:
-    """dq/dt of a body that turns with w in world axes, (4, *batch) [1/s]."""
+    """dq/dt for an angular velocity w in world axes, (4, *batch) [1/s]."""
     return 0.5 * components(*_product([jnp.zeros_like(w[0]), *w], q))
 
 
 @whole(so3_whole.difference, 1, 1)
 def difference(q: Array, p: Array) -> Array:
-    """p as seen from q: the rotation after which q brings to p."""
+    """Orientation p in the axes of q, q^-1 o p."""
     s, x, y, z = q
     return _unit_product([s, -x, -y, -z], p)
 
@@ -351,7 +351,7 @@ def sine(q: Array) -> Array:
 
 
 def gyroscopic(inertia: Array, q: Array, w: Array) -> Array:
-    """w x L, (3, *batch) [N m], world axes: the torque that a steady rotation would take."""
+    """w x L, (3, *batch) [N m], world axes: the torque that a steady rotation would need."""
     return cross(w, spin(inertia, q, w))
 
 

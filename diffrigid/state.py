@@ -21,13 +21,13 @@ COEFFICIENTS = (  # of colliders; all but the first two may be None
 
 
 def rotations(dim: int) -> ModuleType:
-    """The module that knows rotations in `dim` dimensions: so2 or so3."""
+    """Module of rotations in `dim` dimensions: so2 or so3."""
     return so2 if dim == 2 else so3
 
 
 @pytree
 class State:
-    """What a step changes. N bodies in D dimensions; A = 1 or 3, Q = 2 or 4 (see so2, so3).
+    """State of N bodies in D dimensions: all that a step changes. A = 1 or 3, Q = 2 or 4 (see so2, so3).
 
     Example:
         >>> dr.replace(state, w=jnp.array([[5.0]])).q.tolist()  # (cos, sin): unturned

@@ -26,10 +26,10 @@ from diffrigid.trajectory import Trajectory
 from diffrigid.world import World, check, check_kinds
 
 MEMORY = 2**31  # [bytes] of states that reverse mode saves before it rather computes steps again
-MUCH = 100_000_000  # of `work`, from which it pays to compile for longer
-A_BODY = 100  # or a joint: as much work as to find so many numbers
-CALLS = 3000  # of `step`, as it is expected
-WORLDS = 1024  # for as many of them, under `jax.vmap`, there is room where the passes of one world are saved too
+MUCH = 100_000_000  # [-] of `work`: beyond it a longer compilation pays
+A_BODY = 100  # work for a body or a joint, in numbers found by contacts
+CALLS = 3000  # expected number of calls of `step`
+WORLDS = 1024  # under `jax.vmap`: `memory` has room for so many worlds where the passes of one are saved
 
 
 @uncollected
@@ -72,8 +72,8 @@ def rollout(
             of each interval, because it has to be known when tracing.
         controls: values (T, D or A, *batch) that forces with a `control` add, by its name; held over each interval.
         memory: [bytes] that reverse mode may use for saved states. If the states of all T steps do not fit, only about
-            sqrt(T) are kept, and the steps between them are computed again. If all that a step of one world finds out
-            fits into a thousandth of it, no step is computed again, which takes a quarter less to compile.
+            sqrt(T) are kept, and the steps between them are recomputed. If what the contacts of one world find in all
+            steps fits into a thousandth of it, no step is recomputed, which compiles faster.
 
     Raises:
         ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing; memory < 1;
@@ -105,12 +105,12 @@ def rollout(
 
 
 def missed_pairs(world: World, state: State, dt: Any) -> Array:
-    """How many neighbours have no room in a step of dt [s] from `state`, (...), summed over the bodies: should be 0.
+    """Number of neighbours, summed over the bodies, without room in a step of dt [s] from `state`, (...): should be 0.
 
-    In a crowd, 256 discs or spheres and more that no forces act on and that meet only each other and half-spaces,
-    pairs are found by a grid, and each body has room for `Contact(neighbours=...)` others that it could touch within
-    the step at the speeds of its start. More are left out, and may be passed through: raise `neighbours`. Elsewhere
-    every pair is tested.
+    In a crowd, 256 discs or spheres and more without forces that meet only each other and half-spaces, pairs are
+    found by a grid, and each body has room for `Contact(neighbours=...)` others that it could touch within the step at
+    the speeds of its start. More are left out, and may be passed through: raise `neighbours`. Elsewhere every pair is
+    tested.
 
     Args:
         state: of one world, or with leading axes, as `rollout` and `rollout_batch` return it.
@@ -128,7 +128,7 @@ def missed_pairs(world: World, state: State, dt: Any) -> Array:
 
 
 def floats(world: World, state: State) -> tuple[World, State]:
-    """Every leaf as an array of the type of state.x, so that a Python number does not trace anew."""
+    """Convert every leaf to an array of the type of state.x, so that a Python number does not cause another trace."""
     dtype = jnp.result_type(state.x)
 
     def converted(leaf: Any) -> Array:
@@ -139,7 +139,7 @@ def floats(world: World, state: State) -> tuple[World, State]:
 
 
 def step_length(dt: Any, state: State, batch: bool = False) -> Numbers:
-    """dt as an array of the type of the state, checked where it is known; a number unless it may be of a `batch`."""
+    """dt as an array of the type of the state, checked where it is known; a number, or with `batch` also (*batch)."""
     length = numbers("dt", dt, None, finite=False).astype(state.x.dtype)
     allowed = state.x.shape[2:] if batch else ()
     if length.ndim and length.shape != allowed:
@@ -150,14 +150,14 @@ def step_length(dt: Any, state: State, batch: bool = False) -> Numbers:
 
 
 def at_least_one(name: str, count: Any) -> int:
-    """`count`, checked: a number of steps, of worlds, or of bytes."""
+    """Check a count of steps, of worlds, or of bytes, and return it as int."""
     if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
         raise ValueError(f"{name} is {count!r}, expected an integer >= 1")
     return int(count)
 
 
 def _given_substeps(substeps: Any, intervals: int) -> tuple[int, ...]:
-    """Steps of each interval, as given."""
+    """Number of steps of each interval, as given."""
     try:
         counts = tuple(at_least_one("substeps", count) for count in substeps)
     except (TypeError, ValueError):
@@ -170,7 +170,7 @@ def _given_substeps(substeps: Any, intervals: int) -> tuple[int, ...]:
 
 
 def _intervals(times: Any, dtype: Any) -> tuple[Any, Array]:
-    """Times (T+1,) [s], and those between: in double precision where known, for a clock that began long ago."""
+    """Times (T+1,) and intervals [s], the former in double precision where known, for a clock that began long ago."""
     t = numbers("times", times, None)
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
@@ -179,7 +179,7 @@ def _intervals(times: Any, dtype: Any) -> tuple[Any, Array]:
 
 
 def _substeps(intervals: Array, longest: Array) -> tuple[int, ...]:
-    """Steps of each interval, where they are concrete (those of `jax.grad` are)."""
+    """Number of steps of each interval, where these are concrete (as they are under `jax.grad`)."""
     try:
         gaps, dt_known = np.asarray(lax.stop_gradient(intervals)), np.asarray(lax.stop_gradient(longest))
     except jax.errors.TracerArrayConversionError:
@@ -192,12 +192,12 @@ def _substeps(intervals: Array, longest: Array) -> tuple[int, ...]:
 
 
 def steps_in(gaps: np.ndarray, longest: Any) -> np.ndarray:
-    """Equal steps no longer than `longest` in each gap, int; a thousandth more is the rounding of single precision."""
+    """Number of equal steps no longer than `longest` in each gap; a thousandth more is rounding of single precision."""
     return np.maximum(np.ceil(np.asarray(gaps, float) / np.asarray(longest, float) - 1e-3), 1).astype(int)
 
 
 def advance(world: World, state: State, dt: Array, controls: Any) -> State:
-    """One step on arrays with aligned batch axes; dt (*batch)."""
+    """Advance by one step, on arrays with aligned batch axes; dt (*batch)."""
 
     def launch_from(state: State, t0: Array) -> Flight:
         return launch(world, state, controls, t0, dt)
@@ -209,7 +209,7 @@ def advance(world: World, state: State, dt: Array, controls: Any) -> State:
 def aligned(world: World, state: State) -> tuple[World, State]:
     """World and state with the same number of batch axes, and the state with all of the batch.
 
-    So is the world where rows of joints, or of friction against rolling, stand beside contacts in one list.
+    The world, too, has all of the batch where rows of joints or rolling rows are listed beside contacts.
     """
     rank = max(batch_rank(world), batch_rank(state))
     world, state = align(world, rank), align(state, rank)
@@ -245,13 +245,13 @@ ROLLOUT = tuple(
 
 
 def options_for(inputs: tuple, steps: int, worlds: int) -> int:
-    """Which of OPTIONS: those that compile sooner where few steps, or small ones, are to run, of one world or a few.
+    """Index of the OPTIONS to compile with: for few or small steps, of one world or a few, those that compile sooner.
 
-    A crowd would not run as fast, nor a GPU. What is differentiated may not have its own: reverse mode makes a part of
-    another program of it.
+    For a crowd or a GPU, which would run slower, and where JAX was told to compile for speed, those of JAX; also for
+    traced inputs, which may not have options of their own: reverse mode makes a part of another program of them.
 
     Args:
-        inputs: of the program, a world first.
+        inputs: arguments of the program, a world first.
     """
     world = inputs[0]
     if world.crowd or is_for_speed() or jax.default_backend() != "cpu" or traced(inputs) or not is_own_program():
@@ -264,14 +264,14 @@ def _worlds(state: State) -> int:
 
 
 def work(world: World) -> int:
-    """How much a step is to compute, in numbers that its contacts find."""
+    """Estimate of the work of a step, in numbers found by its contacts."""
     return world.contact.saved_numbers(world) + A_BODY * (len(world.names) + sum(map(len, world.joint_names)))
 
 
 def scan_steps(
     world: World, state: State, intervals: Array, controls: Any, counts: tuple[int, ...], memory: int = MEMORY
 ) -> State:
-    """States at the ends of intervals (T, *batch) [s], after `state` itself; interval k takes counts[k] equal steps."""
+    """`state` and the states at the ends of intervals (T, *batch) [s]; interval k takes counts[k] equal steps."""
     owner = np.repeat(np.arange(len(counts)), counts)
     lengths = intervals[owner] / np.array(counts, intervals.dtype)[owner].reshape(-1, *[1] * (intervals.ndim - 1))
     controls = jax.tree.map(lambda leaf: leaf[owner], controls)
@@ -301,12 +301,12 @@ def final_state(world: World, state: State, dt: Array, controls: Any, steps: int
 
 
 def fenced(world: World, saves: bool):
-    """`advance` that reverse mode computes again from the state, behind a `lax.cond` that is always true.
+    """`advance`, which reverse mode recomputes from the state, behind a `lax.cond` that is always true.
 
-    If it `saves` what the passes of a step find and hand on, it computes each pass again from that.
+    If it `saves` what the passes of a step find and hand on, each pass is recomputed from that.
 
     Without the condition XLA fuses the read of the saved state into every loop of the backward step, which then
-    does not vectorise: 34 times the forward cost instead of 6 (sixteen discs, one core).
+    does not vectorise and costs several times as much.
     """
 
     again = saving(*(FOUND, PASSED) * saves)
@@ -323,7 +323,7 @@ def fenced(world: World, saves: bool):
 
 
 def saves_passes(world: World, state: State, steps: int, memory: int) -> bool:
-    """Whether reverse mode saves the passes of all steps: of one world, where they take little of the memory [bytes].
+    """Whether reverse mode saves the passes of all steps: for one world, if they take little of `memory` [bytes].
 
     In a batch they would not stay in the cache.
     """
@@ -333,13 +333,13 @@ def saves_passes(world: World, state: State, steps: int, memory: int) -> bool:
 
 
 def _block_length(state: State, steps: int, memory: int) -> int:
-    """Steps between saved states: 1 while all fit into `memory` [bytes], else about the square root of the steps."""
+    """Number of steps between saved states: 1 while all fit into `memory` [bytes], else about sqrt(steps)."""
     saved = steps * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
     return 1 if saved <= memory else int(np.sqrt(steps))
 
 
 def _blocked_scan(record, state, inputs, steps: int, block: int):
-    """lax.scan whose reverse pass keeps the state at every `block` steps and computes the rest again."""
+    """lax.scan whose reverse pass keeps the state at every `block` steps and recomputes the rest."""
     if block <= 1:
         return lax.scan(record, state, inputs)
     whole = steps // block * block

@@ -7,7 +7,7 @@ import numpy as np
 
 
 def digits(value: float, low: float, high: float, least: int) -> int:
-    """Significant digits that show the width of an interval to two places, `least` at least."""
+    """Number of significant digits that show the width of an interval to two places, at least `least`."""
     width, size = abs(high - low), max(abs(value), abs(low), abs(high))
     if not np.isfinite(width) or width == 0 or size == 0:
         return 4
@@ -15,7 +15,7 @@ def digits(value: float, low: float, high: float, least: int) -> int:
 
 
 def lined_up(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table, in columns, between rules."""
+    """Lines of a table with aligned columns, between rules."""
     table = [header, *rows]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
@@ -24,7 +24,7 @@ def lined_up(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def as_html(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """The same as an HTML element."""
+    """A table as an HTML element."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
     lines = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
     body = "".join(f"<tr>{line}</tr>\n" for line in lines)

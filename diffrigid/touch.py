@@ -17,10 +17,10 @@ class Convex(NamedTuple):
     rounding: np.ndarray  # (R,) [m]; of a half space its offset
     sides: tuple  # pairs of corners
     faces: tuple  # triples of corners, counter-clockwise from outside
-    size: np.ndarray  # (R,) [m] radius that holds it
+    size: np.ndarray  # (R,) [m] radius that encloses it
 
     def take(self, rows: np.ndarray) -> "Convex":
-        """Those of some rows."""
+        """Select some rows."""
         return self._replace(
             corners=None if self.corners is None else self.corners[rows],
             normal=None if self.normal is None else self.normal[rows],
@@ -79,7 +79,7 @@ def _on_plane(a: Convex, corners: np.ndarray, b: Convex, pose: Pose):
 
 
 def _on_sides(corners: np.ndarray, others: np.ndarray, sides: tuple):
-    """Of each corner and the nearest side of the other in 2D: signed distance (M, V), foot on the side, corner."""
+    """For each corner and the nearest side of the other in 2D: signed distance (M, V), foot on the side, corner."""
     start, end = (others[:, [side[n] for side in sides]] for n in (0, 1))
     along = (end - start)[:, None]
     to = corners[:, :, None] - start[:, None]
@@ -93,7 +93,7 @@ def _on_sides(corners: np.ndarray, others: np.ndarray, sides: tuple):
 
 
 def _on_faces(corners: np.ndarray, others: np.ndarray, faces: tuple):
-    """Of each corner and the nearest face that it stands over in 3D; an infinite distance if over none."""
+    """As `_on_sides` for each corner and the nearest face that it is over in 3D; infinite distance if over none."""
     (p, r, s), normal = _planes(others, faces)
     height = ((corners[:, :, None] - p[:, None]) * normal[:, None]).sum(3)
     foot = corners[:, :, None] - height[..., None] * normal[:, None]
@@ -117,7 +117,7 @@ def _planes(corners: np.ndarray, faces: tuple) -> tuple[list[np.ndarray], np.nda
 
 
 def _inside(points: np.ndarray, corners: np.ndarray, faces: tuple, asked: np.ndarray) -> np.ndarray:
-    """Which of the points (M, C, 3) that are `asked` (M, C) are inside a shape, bool (M, C)."""
+    """Whether points (M, C, 3) are inside a shape, bool (M, C); False where not `asked` (M, C)."""
     row, column = np.nonzero(asked)
     (on, *_), normal = _planes(corners, faces)
     height = ((points[row, column][:, None] - on[row]) * normal[row]).sum(2)
@@ -127,7 +127,7 @@ def _inside(points: np.ndarray, corners: np.ndarray, faces: tuple, asked: np.nda
 
 
 def _crossing(corners_a: np.ndarray, sides_a: tuple, corners_b: np.ndarray, sides_b: tuple):
-    """Of every two edges in 3D: distance (M, E F), and the nearest points on b and on a."""
+    """For every two edges in 3D: distance (M, E F), and the nearest points on b and on a."""
     (p, d), (r, e) = ((c[:, [s[0] for s in sides]], c[:, [s[1] for s in sides]] - c[:, [s[0] for s in sides]])
                       for c, sides in ((corners_a, sides_a), (corners_b, sides_b)))  # fmt: skip
     p, d, r, e = p[:, :, None], d[:, :, None], r[:, None], e[:, None]

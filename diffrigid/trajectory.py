@@ -1,4 +1,4 @@
-"""What a rollout returns."""
+"""`Trajectory`, the result of a rollout."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ class Trajectory:
     controls: Any = None  # as given, over each interval
 
     def __getitem__(self, path: str) -> Array:
-        """What a path names, at every time, (T+1, ...); see `diffrigid.paths`."""
+        """Value of a path at every time, (T+1, ...); see `diffrigid.paths`."""
         return jax.vmap(lambda state: read(self.world, state, path))(self.state)
 
     def _repr_html_(self) -> str | None:
@@ -44,10 +44,10 @@ class Trajectory:
 
 
 def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
-    """The trajectory, if it is one of a single world with known values.
+    """Check that a trajectory is one of a single world with known values, and return it.
 
     Raises:
-        ValueError: something else, traced, or a batch.
+        ValueError: not a trajectory, traced, or a batch.
     """
     if isinstance(trajectory, State):
         raise ValueError(

@@ -55,7 +55,7 @@ class World:
     joint_names: tuple[tuple[str, ...], ...] = static()  # of the rows of each record of `joints`
     owners: tuple[tuple[int, ...], ...] = static()
     pairs: tuple[PairGroup, ...] = static()
-    crowd: bool = static(default=False)  # so many bodies that pairs are not listed, but found in every step
+    crowd: bool = static(default=False)  # so many bodies that pairs are found in every step instead of listed
     own_restitution: tuple[bool, ...] = static()  # of each collider: given to it, not the scene's default
     own_friction: tuple[bool, ...] = static()
     own_restitution_falloff: tuple[bool, ...] = static(default=())
@@ -83,7 +83,7 @@ def axis_sizes(world: World) -> dict[str, int]:
 
 
 def check_kinds(world: Any, state: Any) -> None:
-    """Raise ValueError for what is not (world, state)."""
+    """Raise ValueError unless the arguments are (world, state)."""
     if not isinstance(world, World) or not isinstance(state, State):
         raise ValueError(
             f"expected (world, state), got ({type(world).__name__}, {type(state).__name__}): "
@@ -124,7 +124,7 @@ def check(world: World, state: State) -> None:
 
 @functools.lru_cache
 def _check_alike(tree: Any, leaves: tuple) -> None:
-    """`check`, once for all that have the same structure, shapes and types."""
+    """`check`, cached for arguments of the same structure, shapes and types."""
     _check_leaves(*jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves]))
 
 

@@ -1,4 +1,4 @@
-"""Contacts between two shapes at given poses: one function a pair, one table.
+"""Contacts between two shapes at given poses: one function per pair of types, in one table.
 
 `COLLIDERS[type_a, type_b]` is a function of one pair,
 

@@ -4,7 +4,7 @@ from jax import Array
 
 from diffrigid.pytree import array, pytree
 
-FAR = 1e6  # [m] gap of what cannot meet, and reach of what is boundless
+FAR = 1e6  # [m] gap of features that cannot meet, and reach of unbounded shapes
 
 
 @pytree

@@ -18,7 +18,7 @@ from diffrigid.state import rotations
 
 
 def convex_convex(a, x_a: Array, q_a: Array, b, x_b: Array, q_b: Array) -> Contacts:
-    """Vertices of a against b, of b against a, and crossing edges; a lone point needs only itself."""
+    """Contacts of vertices of a with b, of b with a, and of crossing edges; a disc or sphere only by its own centre."""
     dim = x_a.shape[0]
     corners_a, corners_b = _placed(a, x_a, q_a), _placed(b, x_b, q_b)
     slack = _slack(corners_a, radius(a), corners_b, radius(b))

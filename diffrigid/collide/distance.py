@@ -1,13 +1,13 @@
 """Signed distance from the core of a convex shape to a corner of another body, in the shape's own axes.
 
-Each function takes a shape, a point p (D, *batch) [m], and what it is a corner of: `inward` (D, *batch) [m],
-from p to the middle of its body. It returns `(distance, normal)`: (*batch) [m], negative inside, and the unit
-vector from the shape to the point, (D, *batch). On a face the distance is that to its plane and the normal is
-constant: both are smooth through zero. Beyond a corner or an edge it is Euclidean, |p - closest|.
+Each function takes a shape, a point p (D, *batch) [m], which is a corner of another body, and `inward`
+(D, *batch) [m], from p to the middle of that body. It returns `(distance, normal)`: (*batch) [m], negative inside,
+and the unit vector from the shape to the point, (D, *batch). On a face the distance is that to its plane and the
+normal is constant: both are smooth through zero. Beyond a corner or an edge it is Euclidean, |p - closest|.
 
 Where p is at two faces at once, `inward` decides which counts: a body that lies on a face is all in front of
 it. So corner on corner, as in a stack of equal boxes, the normal is that of the face between the two bodies
-and not rounding. `slack` (*batch) [m] is how near counts as at a face, an edge or a corner.
+and not one of rounding. `slack` (*batch) [m] is the distance within which p is at a face, an edge or a corner.
 """
 
 import jax
@@ -83,7 +83,7 @@ def hull_distance(shape: Hull, p: Array, inward: Array, slack: Array) -> tuple[A
     reachable = _reachable(height, facing, slack)
     closest, on_face = jax.vmap(_triangle, in_axes=(0, 0, 0, 0, 0, None, None))(a, b, c, outward, height, p, slack)
     square = jax.vmap(lambda r: dot(r, r))(p[None] - closest)
-    square = square + jnp.where(facing < -slack[None], slack * slack, 0.0)  # of two at an edge, not the side
+    square = square + jnp.where(facing < -slack[None], slack * slack, 0.0)  # at an edge, not the face from behind
     inside = reachable.max(0) <= 0
     best = jnp.where(inside, jnp.argmax(reachable, axis=0), jnp.argmin(square, axis=0))
     chosen = jax.nn.one_hot(best, height.shape[0], axis=0, dtype=p.dtype)
@@ -137,6 +137,6 @@ def core_distance(shape, p: Array, inward: Array, slack: Array) -> tuple[Array, 
 
 
 def reach(shape, dim: int) -> Array:
-    """Radius about the shape's origin that holds all of it, (*batch) [m]."""
+    """Radius about the shape's origin that encloses it, (*batch) [m]."""
     corners = vertices(shape, dim)
     return jax.vmap(norm)(corners).max(0) + radius(shape)

@@ -1,6 +1,6 @@
-"""Edges of two convex shapes in space that cross: planks that lie across each other, and edges that meet.
+"""Crossing edges of two convex shapes in space: planks that lie across each other, and edges that meet.
 
-Of all pairs of edges the few that can touch are chosen without gradient, and evaluated with it.
+The few pairs of edges that can touch are selected without gradient, and evaluated with it.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ ALIKE = 0.5  # cosine: contacts of convex bodies that touch have one normal, up 
 
 
 class Edges(NamedTuple):
-    """E edges in the world, their axis behind that of components: XLA vectorises the last."""
+    """E edges in the world; their axis follows that of components, because XLA vectorises the last axis."""
 
     start: Array  # (3, E, *batch) [m]
     along: Array  # (3, E, *batch) [m] from start to end
@@ -32,12 +32,12 @@ class Edges(NamedTuple):
 def crossing_edges(
     a, corners_a: Array, b, corners_b: Array, contacts: Contacts, separated: Array, slack: Array
 ) -> Contacts:
-    """Contacts where edges cross, 1 to CROSSINGS of them; those that do not exist are FAR apart.
+    """Contacts where edges cross, 1 to CROSSINGS of them; unused ones are FAR apart.
 
     Args:
         corners_a, corners_b: (V, 3, *batch) [m] in the world.
         contacts: those of the corners; where one touches, its normal is that of the crossings as well.
-        separated: (*batch) bool: one of them shows that the bodies do not overlap.
+        separated: (*batch) bool: a corner shows that the bodies do not overlap.
     """
     edges_a, edges_b = edges_of(a, corners_a), edges_of(b, corners_b)
     size_a, size_b = edges_a.start.shape[1], edges_b.start.shape[1]
@@ -78,7 +78,7 @@ class Crossing(NamedTuple):
     on_a: Array  # (3, *batch) [m]
     on_b: Array
     within: Array  # (*batch) bool: both points are inside their edges
-    outermost: Array  # (*batch) bool: along the normal, both edges are where their shapes end
+    outermost: Array  # (*batch) bool: along the normal, both edges are the extremes of their shapes
 
 
 def crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
@@ -117,7 +117,7 @@ def _order(c: Crossing, separated: Array, slack: Array) -> Array:
 
 
 def _along_contact(c: Crossing, contacts: Contacts, slack: Array) -> Array:
-    """Whether K crossings, nearest first, are apart, or along the normal of the bodies where they touch.
+    """Whether each of K crossings, nearest first, is apart, or has about the contact normal of the two bodies.
 
     That is the normal of the deepest corner or, if none touches, of the nearest crossing that is not apart.
     """

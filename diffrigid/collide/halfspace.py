@@ -47,7 +47,7 @@ def _at_corners(corners: Array, rounding: Array, x_a: Array, q_a: Array, b, x_b:
 
 
 def _lowest_side(normal: Array, half: Array) -> Array:
-    """Corners of the side of a box that faces most against a normal in its axes, (2^(D-1), D, *batch) [m].
+    """Corners of the side of a box that faces most against a normal, in the axes of the box, (2^(D-1), D, *batch) [m].
 
     It is the side across the axis along which the corners differ most in height.
     """

@@ -2,7 +2,7 @@
 
 The surface is made of triangles, two to a cell. They are flat, so that distances are exact and in closed form, and
 one fits any three nodes; patches of second order would be smooth inside a cell, but kinked at its border all the same.
-The normal turns steadily over convex edges and nodes, as that of the distance to the solid does.
+The normal turns continuously over convex edges and nodes, as that of the distance to the solid does.
 
 Contacts are those of
 
@@ -11,8 +11,8 @@ Contacts are those of
     convex edges of the grid       with the edges of the shape that cross them
 
 Only the nodes around a body, or a corner without rounding, are looked up: a fixed number, `HeightField.cells` to each
-side, whatever the size of the grid. What is beyond comes no nearer within the time that `unseen_for` gives.
-A search for an impact needs all of the `candidates`; of those the nearest few are contacts.
+side, whatever the size of the grid. Nodes beyond are not reached within the time that `unseen_for` gives.
+A search for an impact needs all of the `candidates`; the nearest few of them are contacts.
 """
 
 from collections.abc import Callable
@@ -34,27 +34,27 @@ from diffrigid.state import rotations
 
 TOUCHES = 4  # contacts of a corner at most: a pit has three faces or more
 PEAKS = 4  # nodes at most that touch a body
-SAME = 1e-6  # [-] 1 - cosine: faces less apart than 1.4 mrad are one plane
+SAME = 1e-6  # [-] 1 - cosine: faces whose normals differ by less than 1.4 mrad are one plane
 SIGHT = 0.5  # [cells] that are looked up beyond the reach of a body, at least
 
 
 @jax.jit
 def convex_heights(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array) -> Contacts:
-    """The nearest: TOUCHES of every corner and, unless a is a sphere, PEAKS of nodes and CROSSINGS of edges."""
+    """The nearest contacts: TOUCHES of every corner and, unless a is a sphere, PEAKS of nodes, CROSSINGS of edges."""
     return _contacts(a, x_a, q_a, b, x_b, q_b, _nearest)
 
 
 @jax.jit
 def candidates(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array) -> Contacts:
-    """All that a may touch within the step, with gaps no greater than what is left of the way to them."""
+    """All contacts that a may reach within the step; no gap is larger than the way left to it."""
     return _contacts(a, x_a, q_a, b, x_b, q_b, lambda contacts, count, slack: contacts)
 
 
 def unseen_for(b: HeightField, q_b: Array, height: Array, v: Array, spinning: Array) -> Array:
-    """Time until a body may come to what was not looked up, (*batch) [s].
+    """Lower bound on the time until the body can reach cells that were not examined, (*batch) [s].
 
     Args:
-        height: (*batch) [m] of all of the body over the highest node.
+        height: (*batch) [m] of the whole body over the highest node.
         v: (3, *batch) [m/s] of its centre.
         spinning: (*batch) [m/s] what spin and acceleration may add to the speed of its points.
     """
@@ -65,17 +65,17 @@ def unseen_for(b: HeightField, q_b: Array, height: Array, v: Array, spinning: Ar
 
 
 def height_over(b: HeightField, x: Array, x_b: Array, q_b: Array) -> Array:
-    """Of a point over the highest node, (*batch) [m]."""
+    """Height of a point over the highest node, (*batch) [m]."""
     return rotations(3).unrotate(q_b, x - x_b)[2] - b.heights.max((0, 1))
 
 
 def cells_for(spacing: Array, size: Array) -> Array:
-    """`HeightField.cells` that hold a body of this reach [m], and SIGHT beyond it."""
+    """Number `HeightField.cells` that covers a body of this reach [m], and SIGHT beyond it."""
     return jnp.ceil(size / spacing + 0.5 + SIGHT)
 
 
 def _contacts(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array, some: Callable) -> Contacts:
-    """Those of all kinds; `some(contacts, count, slack)` of each."""
+    """Contacts of all kinds; `some(contacts, count, slack)` selects those of each kind."""
     so, size = rotations(3), lax.stop_gradient(reach(a, 3))
     slack, alert = np.sqrt(np.finfo(size.dtype).eps).astype(size.dtype) * size, ALERT * size
     middle = so.unrotate(q_b, x_a - x_b)
@@ -113,7 +113,7 @@ def _moved(c: Contacts, p: Array) -> Contacts:
 
 
 def _nearest(c: Contacts, count: int, slack: Array | None) -> Contacts:
-    """The `count` contacts with the least gaps; with `slack`, one of those that have the same gap and normal."""
+    """Select the `count` contacts with the least gaps; with `slack`, only one of those with the same gap and normal."""
     gap, normal = lax.stop_gradient((c.gap, c.normal))
 
     def pick(left, _):
@@ -148,7 +148,7 @@ class Around(NamedTuple):
 
 
 def _around(b: HeightField, p: Array, cells: Any) -> Around:
-    """The nodes `cells` to each side of that nearest to p, and one more; beyond the grid those of its border go on."""
+    """Nodes `cells` to each side of the one nearest to p, and one more; the border's heights go on beyond the grid."""
     batch = jnp.broadcast_shapes(p.shape[1:], b.heights.shape[2:], b.spacing.shape)
     count, lead = 2 * cells + 3, (1,) * len(batch)
     steps = np.arange(-cells - 1, cells + 2).astype(p.dtype).reshape(-1, *lead)
@@ -171,7 +171,7 @@ def _around(b: HeightField, p: Array, cells: Any) -> Around:
 
 
 def _faces(around: Around, slack: Array, alert: Array, rounding: Array) -> Contacts:
-    """Both faces of all cells. Over one, the distance of its plane; else, in front of it, no less than ALERT."""
+    """Contacts with both faces of all cells: over one, the distance to its plane; else, in front, at least ALERT."""
     near, far = around.at(0, 0), around.at(1, 1)
     rows = (near, near), (around.at(1, 0), far), (far, around.at(0, 1))
     start = jnp.stack([jnp.concatenate(row, 1) for row in rows], 1)  # (3, 3, 2 F, *batch): component, side, face
@@ -185,10 +185,10 @@ def _faces(around: Around, slack: Array, alert: Array, rounding: Array) -> Conta
     away = (side[None] * foot).sum(1)
     distance = norm(away)
     inside = (below & (height < 0)).any(0)
-    # In the crease of a valley it may be over none: then it is over what is straight above.
+    # In the crease of a valley it may be over none: then it counts as over the faces straight above it.
     over = over | (below & ~over.any(0)[None] & inside[None])
     best = jnp.where(over & (height < 0), height, -jnp.inf).max(0)
-    # `slack`: what is computed twice may be rounded differently.
+    # `slack`: values that are computed twice may be rounded differently.
     touches = over & ((height >= -slack[None]) | (inside[None] & (height >= (best - slack)[None])))
     gap = jnp.where(height > slack[None], jnp.maximum(distance - rounding[None], alert[None]), FAR)
     gap = jnp.where(touches, height - rounding[None], gap)
@@ -196,7 +196,7 @@ def _faces(around: Around, slack: Array, alert: Array, rounding: Array) -> Conta
 
 
 def _edges(around: Around, slack: Array, rounding: Array) -> Contacts:
-    """The edges of both faces beside which the corner is, not over them."""
+    """Contacts with edges, where the corner is over neither of the two faces that meet there."""
     start, along, left, right = _grid_edges(around)
     length = norm(along)
     unit = along / length[None]
@@ -211,7 +211,7 @@ def _edges(around: Around, slack: Array, rounding: Array) -> Contacts:
 
 
 def _tops(around: Around, slack: Array, rounding: Array) -> Contacts:
-    """The nodes of which the corner is above all edges."""
+    """Contacts with nodes, where the corner is beyond the ends of all edges that meet there."""
     away = -around.at(0, 0)
     spokes = _spokes(around)
     on = (away[2] > 0) & (dot(away[:, None] + jnp.zeros_like(spokes), spokes) < -slack).all(0)
@@ -244,7 +244,7 @@ def _spokes(around: Around) -> Array:
 def _peaks(
     b: HeightField, around: Around, distance_of: Callable, slack: Array, alert: Array, rounding: Array
 ) -> Contacts:
-    """The convex nodes with the core of a body, where its normal is one of the node's."""
+    """Contacts of convex nodes with the core of a body, where its normal is among those of the node."""
     turn = np.sqrt(np.finfo(slack.dtype).eps)
     x, y = ((around.at(*end)[2] - around.at(*(-i for i in end))[2]) for end in ((1, 0), (0, 1)))
     up = normalise(components(-x, -y, 2.0 * b.spacing[None] + jnp.zeros_like(x)))
@@ -265,7 +265,7 @@ def _peaks(
 
 
 def _ridges(own: Edges, around: Around, size: Array, slack: Array, rounding: Array) -> Contacts:
-    """Where edges of the body cross convex edges of the grid, and neither solid is beyond the common normal."""
+    """Contacts where edges of the body cross convex edges of the grid, both extreme along the common normal."""
     grid = _grid_edges(around)
     convex = dot(cross(grid.along, grid.left), grid.right)
     steep = slack[None] * norm(cross(grid.along, grid.left))

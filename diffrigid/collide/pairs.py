@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PairGroup:
-    """P pairs of one kind; on each side all move or none does.
+    """P pairs of one kind; on each side all colliders move, or none does.
 
     Shape a of pair p is row `row_a[p]` of `world.shapes[shape_a]`, on collider `a[p]`; b likewise.
     """
@@ -40,7 +40,7 @@ def pair_groups(kinds, owners, moving: int, ignore, table, count) -> tuple[PairG
             if first[2] >= moving or frozenset((first[2], second[2])) in ignore:
                 continue
             a, b = _ordered(first, second, kinds, table)
-            key = (a[0], b[0], a[2] < moving, b[2] < moving)  # sides that never move are handled apart
+            key = (a[0], b[0], a[2] < moving, b[2] < moving)  # statics form groups of their own
             found.setdefault(key, []).append((a[1], b[1], a[2], b[2]))
     groups = []
     for (shape_a, shape_b, *_), pairs in found.items():

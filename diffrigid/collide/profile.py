@@ -23,13 +23,13 @@ from diffrigid.numerics import dot, norm, normalise
 from diffrigid.shapes import Disc, Profile, radius, vertices
 from diffrigid.state import rotations
 
-ALERT = 4e-3  # [-] of the size: least gap of what may meet within the step; above `NEAR` of the impact time
-STRAIGHT = 1e-4  # one less the cosine between two segments along which a body goes on as along one
-TURN = 1e-9  # [rad] by which a convex vertex turns at least
+ALERT = 4e-3  # [-] of the size: least gap of a feature that may be met within the step; above `NEAR` of the search
+STRAIGHT = 1e-4  # [-] 1 - cosine of two segments, below which a body moves along them as along one
+TURN = 1e-9  # [rad] least turn of a convex vertex
 
 
 def convex_profile(a, x_a: Array, q_a: Array, b: Profile, x_b: Array, q_b: Array) -> Contacts:
-    """Every corner with every segment and, unless a is a disc, every inner vertex of b with a."""
+    """Contacts of every corner with every segment and, unless a is a disc, of every inner vertex of b with a."""
     so = rotations(2)
     slack, alert = _lengths(a)
     corners = jax.vmap(lambda p: so.unrotate(q_b, x_a + so.rotate(q_a, p) - x_b))(vertices(a, 2))
@@ -49,7 +49,7 @@ def convex_profile(a, x_a: Array, q_a: Array, b: Profile, x_b: Array, q_b: Array
 
 
 def on_next_segments(a, b: Profile, rests: Array) -> Array:
-    """Which contacts of `convex_profile` rest (K, *batch), with those of a corner that rests, on segments straight on.
+    """Extend `rests` (K, *batch) of `convex_profile`: a resting corner also rests on segments in line with its own.
 
     So a body that slides or rolls from one segment to the next is held there as before, and does not strike it.
     """
@@ -72,7 +72,7 @@ def clearance(b: Profile, p: Array) -> Array:
 
 
 def _lengths(a) -> tuple[Array, Array]:
-    """Distances within which features coincide, and of the least alert, (*batch) [m]."""
+    """Slack, the distance within which features coincide, and the least gap by ALERT, (*batch) [m]."""
     size = lax.stop_gradient(reach(a, 2))
     return np.sqrt(np.finfo(size.dtype).eps).astype(size.dtype) * size, ALERT * size
 
@@ -89,7 +89,7 @@ def _up(along: Array) -> Array:
 
 
 def _beyond(share: Array, length: Array) -> tuple[Array, Array]:
-    """How far a point is beyond the start and the end of each segment, (S, *batch) [m]; the outer ones have none."""
+    """How far a point is beyond the start and the end of each segment, (S, *batch) [m]; -inf at the outer two ends."""
     nowhere = jnp.full_like(share[:1], -jnp.inf)
     before = jnp.concatenate([nowhere, -share[1:]])
     return before, jnp.concatenate([(share - length)[:-1], nowhere])
@@ -106,14 +106,14 @@ def _inside(b: Profile, p: Array) -> Array:
 
 
 def _corner_contacts(b: Profile, p: Array, rounding: Array, slack: Array, alert: Array) -> Contacts:
-    """One corner with all segments, (S, ...), in the profile's axes."""
+    """Contacts of one corner with all segments, (S, ...), in the profile's axes."""
     start, along, end, length = _segments(b)
     up = _up(along)
     height, share = (jax.vmap(dot)(r, p[None] - start) for r in (up, along))
     before, after = _beyond(share, length)
     over = jnp.maximum(before, after) <= slack[None]
     best = jnp.where(over & (height < 0), height, -jnp.inf).max(0)  # inside, the least deep
-    # `slack`: what is computed twice may be rounded differently.
+    # `slack`: values that are computed twice may be rounded differently.
     touches = over & ((height >= -slack[None]) | (_inside(b, p)[None] & (height >= (best - slack)[None])))
     touches = touches | (
         _over_valley(along, over, before - slack[None], after - slack[None]) & (height >= -slack[None])
@@ -134,8 +134,8 @@ def _corner_contacts(b: Profile, p: Array, rounding: Array, slack: Array, alert:
 def _over_valley(along: Array, over: Array, before: Array, after: Array) -> Array:
     """Whether a corner is over a neighbour that makes a valley with a segment, (S, *batch) bool.
 
-    There the line of the segment goes on below the neighbour: a corner that comes to it has come to the valley, even if
-    it has fallen by a little since it was last held.
+    There the line of the segment continues below the neighbour: a corner that reaches it has reached the valley, even
+    if it has fallen a little since it was last held.
     """
     none = jnp.zeros_like(over[:1])
     valley = jnp.concatenate([(jax.vmap(_cross)(along[:-1], along[1:]) > TURN) & ~none, none])  # at its end
@@ -144,12 +144,12 @@ def _over_valley(along: Array, over: Array, before: Array, after: Array) -> Arra
 
 
 def _shifted(flags: Array) -> Array:
-    """Flags of each segment for the next."""
+    """Shift flags by one: each segment gets that of the one before."""
     return jnp.concatenate([jnp.zeros_like(flags[:1]), flags[:-1]])
 
 
 def _vertex_contacts(b: Profile, distance_of, rounding: Array, slack: Array, alert: Array) -> Contacts:
-    """The inner vertices with the core of a body, (S - 1, ...), in the profile's axes."""
+    """Contacts of the inner vertices with the core of a body, (S - 1, ...), in the profile's axes."""
     _, along, _, length = _segments(b)
     up = _up(along)
 

@@ -17,6 +17,6 @@ class Anchors:
 
 
 def struck(f: Flight, t: Array, q: Array, dv: Array, dL: Array) -> State:
-    """A body at time t (*batch) [s] of its path, where it is turned to q and gets dv [m/s] and dL [kg m^2/s]."""
+    """State of a body at time t (*batch) [s] of its path, with orientation q, after changes dv [m/s], dL [kg m^2/s]."""
     w = rotations(f.dim).unspin(f.inverse_inertia, q, angular_momentum(f, t) + dL)
     return State(x=position(f, t), q=q, v=velocity(f, t) + dv, w=w)

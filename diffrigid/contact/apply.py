@@ -1,4 +1,4 @@
-"""From the contacts of a pass to the bodies after it: what acts, how it moves them, and where they are anchored anew.
+"""From the contacts of a pass to the bodies after it: solve for impulses, move the bodies, and re-anchor them.
 
 A resting contact force is constant over the time T since the last impact of the body. Its impulse P changes v by P / m
 and x by (T / 2) P / m: its centroid is in the middle of that time, and so are its lever arms (`levers.py`). For a block
@@ -37,16 +37,17 @@ def apply_impulses(
     held_for: Array,
     known: Known | None,
 ) -> tuple[Anchors, Known | None, Array | None]:
-    """Solve for the impulses and anchor every struck body anew at the time of its impact.
+    """Solve for the impulses and re-anchor every struck body at the time of its impact.
 
-    Anchoring is the lever x += (h - s) P / m and, for turns, the composition of those before and after s.
+    Re-anchoring at s makes P displace the body by (h - s) P / m until the end h of the step, and composes the rotations
+    before and after s.
 
     Args:
         kick: 1, or 0 for a displacement that leaves velocities as they are.
         held_for: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
 
     Returns:
-        the anchors; where impulses are `known`, those of friction that reverses, and what undoes the loads.
+        the anchors; with `known`, the impulses of friction that reverses, and the corrections that undo the loads.
     """
     moving, active, held = flight.t0.shape[0], strikes.active.astype(kick.dtype), strikes.held.astype(kick.dtype)
     each = jnp.stack([active, active * strikes.s, held], axis=1)
@@ -76,18 +77,18 @@ def apply_impulses(
     kicked = kick * dv, kick * dL + kept
     if onto is not None:
         kicked = kicked[0] + onto[0], kicked[1] + onto[2]
-    # The path from where a body was held until, followed backwards, is its own but to second order.
+    # The new path of a body that was held, followed backwards, agrees with its true path to second order.
     since = jnp.where(count > 0, jnp.where((kick > 0) & (evenly > 0), flight.t0, t), anchors.since)
     return _anchored(flight, t, q, since, kicked, moved), friction, load
 
 
 def _no_faster_than_drift(mobility: Mobility, dL: Array, strikes: Strikes) -> Array:
-    """dL (N, A, *batch), lessened where a rim would gain more than bodies drift apart, and none where some are deep.
+    """Limit dL (N, A, *batch) to rotations no faster than bodies drift apart; zero where some contact is deep.
 
-    Bodies that are so deep inside each other that no displacement is enough press without bound, which makes energy.
+    Bodies that are so deep inside each other that no displacement suffices would press without bound, and gain energy.
     """
     dw = jax.vmap(rotations(strikes.drift.shape[1]).apply)(mobility.inverse_inertia, dL)
-    rim = safe_sqrt((mobility.inverse_mass * (dL * dw).sum(1)).max(0))  # of as much energy as the turn
+    rim = safe_sqrt((mobility.inverse_mass * (dL * dw).sum(1)).max(0))  # speed of the same energy as the rotation
     deep = (strikes.active & (strikes.gap < -strikes.deepest)).any(0)
     most = jnp.where(deep, 0.0, 2.0 * jax.vmap(norm)(strikes.drift).max(0))
     return jnp.where(rim > most, safe_divide(most, rim), 1.0)[None, None] * dL
@@ -97,7 +98,7 @@ def _solved(
     world: Any, at: tuple[Flight, Array, Mobility], strikes: Strikes, law: Law, kick: Array, held_for: Array,
     known: Known | None, count: Array,
 ) -> tuple[Strikes, Law, Array, Array, Array]:  # fmt: skip
-    """Strikes, law and times with the rows of rolling, impulses that are not known, and what stops early of them."""
+    """Strikes, law and times with the rolling rows, the unknown impulses, and their corrections for early stops."""
     (flight, t, mobility), stopped = at, stopping_early
     if is_rolling(world):
         strikes, law, held_for = with_rows(world, strikes, law, held_for, flight, t, mobility, kick)
@@ -107,17 +108,17 @@ def _solved(
     if known is not None:
         strikes, law = beside(mobility, strikes, law, known)
     guess = barely(strikes, world.contact.rest_speed)
-    if known is not None:  # what rests has next to no gaps, so that it is displaced back by what undid its loads
+    if known is not None:  # resting contacts have almost no gaps, so what displaces them back is what undid their loads
         guess = jnp.where(kick > 0, guess, -known.P)
     P = solve_impulses(strikes, law, mobility, count, world.contact.rest_speed, lax.stop_gradient(guess))
     return strikes, law, held_for, P, stopped(mobility, strikes, P, law, held_for)
 
 
 def _onto_joints(flight: Flight, t: Array, link: Linkage, hit: Array) -> tuple[Array, Array, Array]:
-    """Changes of v, w and L that bring the velocities of bodies that are `hit` (N, *batch) onto their joints.
+    """Changes of v, w and L that project the velocities of `hit` bodies (N, *batch) onto their joints.
 
-    A flight leaves the joints by the error of its integration. Contacts cannot mend that: two that stick on two bodies
-    of one linkage would press without bound.
+    Flight violates the joints by its integration error. Contacts cannot correct that: two sticking contacts on two
+    bodies of one linkage would press without bound.
     """
     apply, on = rotations(flight.dim).apply, hit[:, None].astype(t.dtype)
     v, L = jax.vmap(velocity)(flight, t), jax.vmap(angular_momentum)(flight, t)
@@ -147,11 +148,11 @@ def _posed(world: Any, flight: Flight, t: Array, ago: Array) -> tuple[Array, Mob
 
 
 def _anchored(flight: Flight, t: Array, q: Array, since: Array, kicked: tuple, moved: tuple) -> Anchors:
-    """Every body anchored anew at its time t.
+    """Re-anchor every body at its time t.
 
     Args:
         q: orientations at t.
-        since: (N, *batch) [s] from when on its new path holds.
+        since: (N, *batch) [s] earliest time for which its new path holds.
         kicked: changes of v (N, D, *batch) [m/s] and L (N, A, *batch) [N m s].
         moved: displacement (N, D, *batch) [m] and turn (N, A, *batch) [rad]; L is kept in the turn.
     """

@@ -1,4 +1,4 @@
-"""What the gaps of a pair at one time tell of its next impact: how long none can close, when one does, which rest.
+"""The next impact of a pair, from its gaps at one time: how long none can close, when one does, which contacts rest.
 
 Source: Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems (1996), for the advancement.
 """
@@ -18,11 +18,11 @@ from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.shapes import HeightField
 from diffrigid.state import rotations
 
-ROUNDING = 1e5  # [-] of the last digit of NEAR: how far rounding of their places may hold bodies apart
+ROUNDING = 1e5  # [-] times eps times the near distance: gap that rounding of positions may leave at touching bodies
 
 
 class Task(NamedTuple):
-    """What is searched: the first impact of two colliders from `start` to t1."""
+    """The search problem: the first impact of two colliders from `start` to t1."""
 
     a: Side
     b: Side
@@ -34,54 +34,54 @@ class Task(NamedTuple):
 
     @property
     def span(self) -> Array:
-        """(*batch) [s]"""
+        """Length of the interval searched, (*batch) [s]."""
         return self.t1 - self.start
 
     @property
     def slack(self) -> Array:
-        """What is small beside 1: the root of rounding."""
+        """Relative tolerance [-], sqrt(eps)."""
         return jnp.sqrt(jnp.finfo(self.t1.dtype).eps)
 
 
 def task_of(a: Side, b: Side, t1: Array, width: Array | None, slow: Array) -> Task:
-    """Without derivatives: else a loop that searches would carry tangents in vain."""
+    """Make the task, without derivatives: else a search loop would carry tangents in vain."""
     task = Task(a, b, earliest(a, b)[0], t1, jnp.minimum(reach_of(a), reach_of(b)), slow, width)
     return lax.stop_gradient(task)
 
 
 def if_smooth(width: Array | None, smooth, exact, *args: Array) -> Any:
-    """smooth(*args) if any width is positive, else exact(*args)."""
+    """Evaluate smooth(*args) if any width is positive, else exact(*args)."""
     return exact(*args) if width is None else lax.cond(any_world(width > 0), smooth, exact, *args)
 
 
 def touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array:
-    """Whether a gap is closed, or about to close, no faster than `slow` [m/s]; rounding does not keep it open."""
+    """Whether a gap is closed, or about to close, and no faster than `slow` [m/s]; rounding does not keep it open."""
     open_by = jnp.maximum(gap - ROUNDING * jnp.finfo(gap.dtype).eps * near, 0.0)
     return (gap <= near) & (v * v + 2.0 * open_by * jnp.abs(acc) <= slow**2)
 
 
 def resting(task: Task, gaps: Gaps) -> Array:
-    """Contacts (K, *batch) that touch, or are about to, and close no faster than what is slow; bool.
+    """Whether contacts rest, (K, *batch) bool: they touch, or are about to, and close slowly.
 
-    If one contact of the pair rests, so do all that are slow enough to come to rest anyway. Else, in a flight that
-    nothing holds up, they would be found to close first, and hide the fast impact of another corner.
+    If one contact of the pair rests, so do all that are slow enough to come to rest anyway. Else, in a free flight
+    without support, they would be found to close first, and hide the fast impact of another corner.
     """
     gap, v, acc, _ = gaps
     near, slow = (NEAR * task.size)[None], task.slow[None]
     touching = touches(gap, v, acc, near, slow)
-    # What closes by a third of its fall would be back within the step, whatever e <= 1.
+    # A contact that closes at a third of the speed of its fall would be back within the step, whatever e <= 1.
     least = slow + jnp.maximum(-acc, 0.0) * jnp.maximum(task.span, 0.0)[None] / 3.0
     return touching | (touches(gap, v, acc, near, least) & touching.any(0)[None])
 
 
 def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:
-    """How long from s no contact can close that does not rest, (*batch) [s]; <= 0 if one is near and closing.
+    """Make the function: time from s before which only resting contacts can close, (*batch) [s]; <= 0: one is closing.
 
-    It is the least, over the contacts, of the gap over a bound on the closing speed for the present normal (Mirtich
-    1996), so that a body that only translates arrives in one advance. The gap of a corner and a plane is a smooth
-    function of time: until t1 it stays above the parabola that is its own, bent down further by as much as its third
-    derivative can be, which takes two or three advances. A contact that touches and separates may be passed for as long
-    as its parabola stays open.
+    It is the minimum over the contacts of the gap divided by a bound on the closing speed for the present normal
+    (Mirtich 1996), so that a body that only translates arrives in one advance. The gap of a corner and a plane is a
+    smooth function of time: until t1 it stays above its own parabola bent down further by a bound on its third
+    derivative, which takes two or three advances. A contact that touches and separates may be passed for as long as its
+    parabola stays open.
     """
     a, b, t1, near = task.a, task.b, task.t1, NEAR * task.size
     (spin_a, jerk_a), (spin_b, jerk_b) = (_unsteady(side, jnp.maximum(task.span, 0.0)) for side in (a, b))
@@ -108,34 +108,34 @@ def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:
 
 
 class Polish(NamedTuple):
-    """A step along the parabola of the first gap to close, and what was seen before it."""
+    """A step along the parabola of the first gap to close, and what the gaps were before it."""
 
-    dt: Array  # (*batch) [s] until the first contact that does not rest comes to its level; 0 if none does
-    closes: Array  # (*batch) bool: it does; else it may turn back then
-    at_level: Array  # (*batch) bool: some contact is there
+    dt: Array  # (*batch) [s] until the first contact that does not rest reaches its level; 0 if none does
+    closes: Array  # (*batch) bool: it reaches it then; else its gap may turn back then
+    at_level: Array  # (*batch) bool: some contact is at its level
     inside: Array  # (*batch) bool: some contact is within its level, and closing
 
     def converged(self, task: Task) -> Array:
-        """(*batch) bool"""
+        """Whether the step is within the tolerance in time, (*batch) bool."""
         return jnp.abs(self.dt) <= task.slack * task.span
 
     def found(self, task: Task) -> Array:
-        """(*batch) bool. The last step closes the gap, which at its start may have been wider than the slack."""
+        """Whether an impact is found, (*batch) bool. The last step may close a gap that was wider than the slack."""
         return self.at_level | (self.closes & self.converged(task))
 
 
 def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Polish:
-    """From time s (*batch) [s] to where a gap is `level` (*batch) [m]."""
+    """Step from time s (*batch) [s] to where a gap is `level` (*batch) [m]."""
     (gap, v, acc, _), slack, level = gaps, task.slack, level[None]
     height = gap - level
     there = (jnp.abs(height) <= 8.0 * slack**2 * task.size[None]) & (v < 0)  # to rounding
     closing = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
     dt = closing
-    if gaps.normal is not None:  # which turns: that the gap opens again is only known after a look at where it would
+    if gaps.normal is not None:  # it turns: whether the gap opens again is only known from a look at where it would
         opens = (v < 0) & (height > 0) & (v * v < 2.0 * acc * height) & ~rests
         turns = jnp.where(opens, safe_divide(-v, acc), 0.0)
         dt = jnp.minimum(dt, _least(jnp.where(turns > (slack * task.span)[None], turns, jnp.inf)))
-    # What is later is no impact; that a step leads a little beyond the end does not tell yet.
+    # A later time is no impact; but a step to a little beyond the end does not decide that yet.
     within = (dt < 0) | ((s < task.t1 + slack * task.span) & (s + dt < task.t1 + task.span))
     at_level = (gap <= level + (slack * task.size)[None]) & ((v < 0) | (acc < 0)) & ~rests
     inside = (gap <= level) & (v < 0) & ~rests
@@ -154,7 +154,7 @@ def _time_to(height: Array, v: Array, acc: Array) -> Array:
 
 
 def _least(times: Array) -> Array:
-    """Of the contacts (K, *batch). Written out only where they are few: the program is not to grow with a grid."""
+    """Minimum over the contacts (K, *batch); unrolled only for few, so that the program does not grow with a grid."""
     return fold(jnp.minimum, times, 0) if len(times) <= MANY else times.min(0)
 
 
@@ -167,9 +167,9 @@ def angular_speed(side: Side) -> Array:
 
 
 def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
-    """Bounds within the step on what spin and acceleration add to the speed of a point, and on its third derivative.
+    """Bounds within the step on what spin and acceleration add to a point's speed, and on its third derivative.
 
-    (*batch) [m/s], [m/s^3]. Without a torque a rigid body has no greater angular acceleration than w^2, which bounds
+    (*batch) [m/s], [m/s^3]. Without a torque the angular acceleration of a rigid body does not exceed w^2, which bounds
     the third derivative of an arm r by 6 w^3 r.
     """
     f = side.flight

@@ -1,4 +1,4 @@
-"""What contacts may do: the cone of friction, and two projections onto it."""
+"""The friction cone of contacts, and two projections onto it."""
 
 from typing import Any
 
@@ -12,39 +12,39 @@ from diffrigid.pytree import array, pytree
 
 @pytree
 class Cone:
-    """What C contacts demand of the velocity after their impulses."""
+    """Contact law of C contacts and rows: target velocities, and bounds of the impulses."""
 
     on: Array = array("C")  # 1 where the contact takes part, else 0
-    rest_speed: Array = array()  # (*batch) [m/s] slow, for the world: its impulses are found to a small part of it
-    sharing: Array = array("C")  # contacts on the body that has more of them
-    scale: Array = array("C")  # k [1/kg] of the order of the contact's mobility; of many solutions it chooses one
+    rest_speed: Array = array()  # (*batch) [m/s] slow in this world: impulses are solved to a small fraction of it
+    sharing: Array = array("C")  # number of contacts on that of its two bodies that has more of them
+    scale: Array = array("C")  # k [1/kg] of the order of the contact's mobility; it selects one of many solutions
     normal: Array = array("C", "D")
     target: Array = array("C")  # [m/s]
     mu: Array = array("C")
-    most: Any = array("C", default=None)  # [N s] of a row that acts to both sides, as friction; elsewhere infinite
-    spin: Any = array("K", default=None)  # [m] the K rows behind the first K contacts turn, and are loaded by these:
-    # of the normal impulse of its contact each may act with `spin` along its normal, to both sides, and `mu` across it
+    most: Any = array("C", default=None)  # [N s] bound of a two-sided row, as joint friction; elsewhere infinite
+    spin: Any = array("K", default=None)  # [m] of the K rolling rows, which follow the first K contacts: times the
+    # normal impulse of its contact, `spin` bounds a row along the normal, two-sided, and `mu` bounds it across
 
 
 def push(cone: Cone, z_n: Array, one_sided: Array) -> Array:
-    """Normal impulse within its bounds: `one_sided`, or between -most and most."""
+    """Normal impulse within its bounds: `one_sided`, or z_n clipped to [-most, most] in a two-sided row."""
     if cone.most is None:
         return one_sided
     return jnp.where(jnp.isinf(cone.most), one_sided, jnp.clip(z_n, -cone.most, cone.most))
 
 
 def put(spin: Array, values: Array, others: Array) -> Array:
-    """`values` of all contacts and rows, with `others` for those of the rows that turn."""
+    """Replace the entries of the rolling rows in `values`, of all contacts and rows, by `others`."""
     return jnp.concatenate([values[: len(spin)], others, values[2 * len(spin) :]])
 
 
 def turning(spin: Array, values: Array) -> Array:
-    """`values` of the rows that turn."""
+    """Entries of `values` for the rolling rows."""
     return values[len(spin) : 2 * len(spin)]
 
 
 def loaded(cone: Cone, normal: Array, z_n: Array, bound: Array) -> tuple[Array, Array]:
-    """Normal impulses, and bounds of what acts across, where those of contacts are known and load rows that turn."""
+    """Normal impulses and tangential bounds, those of rolling rows set by the normal impulses of their contacts."""
     if cone.spin is None:
         return normal, bound
     load = normal[: len(cone.spin)]
@@ -62,7 +62,7 @@ def split(normal: Array, z: Array) -> tuple[Array, Array]:
 
 @jax.jit
 def allowed(cone: Cone, z: Array) -> Array:
-    """The impulse that pushes as z does, and rubs as z does, but with no more than mu times that; (C, D, *batch)."""
+    """Project z onto the cone, (C, D, *batch): its normal part if it pushes, its tangential part up to mu times it."""
     z_n, z_t = split(cone.normal, jnp.where(cone.on[:, None] > 0, z, 0.0))
     normal = push(cone, z_n, jnp.maximum(z_n, 0.0))
     size, bound = jax.vmap(norm)(z_t), cone.mu * jnp.maximum(z_n, 0.0)
@@ -72,7 +72,7 @@ def allowed(cone: Cone, z: Array) -> Array:
 
 
 def nearest(cone: Cone, z: Array) -> Array:
-    """The impulse in the cone that is nearest to z, (C, D, *batch); of rows that turn, nearest under their load."""
+    """Project z to the nearest impulse in the cone, (C, D, *batch); rolling rows under the load of their contacts."""
     z_n, z_t = split(cone.normal, z)
     size, mu = jax.vmap(norm)(z_t), cone.mu
     sticks, parts = (size <= mu * z_n) & (z_n > 0), mu * size <= -z_n

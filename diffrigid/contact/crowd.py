@@ -1,12 +1,12 @@
-"""Very many discs or spheres: a step whose cost grows as their number, with neighbours from a grid.
+"""A step for very many discs or spheres: its cost is proportional to their number, with neighbours from a grid.
 
 The bodies of all worlds lie side by side on the last axis, which vectorises: arrays are (..., M) for M bodies. In each
 round every body finds its next impact, without derivatives. Pairs that are each other's next impact collide now, as do
-bodies that meet a static: their impacts are gathered, evaluated and put back. An impact that is next for only one of
-the two waits for a later round, so that all happen in order. One that the rounds leave over is found, and repaired, by
-the next step.
+bodies that meet a static: their impacts are gathered, evaluated and scattered back. An impact that is next for only
+one of the two waits for a later round, so that all happen in order. One that the rounds leave over is found, and
+repaired, by the next step.
 
-Nothing here holds what rests, so that there are no forces.
+Resting contacts are not held here, so these worlds have no forces.
 """
 
 import functools
@@ -32,20 +32,20 @@ from diffrigid.pytree import map_arrays, pytree, replace
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State, rotations
 
-MANY = 256  # bodies from which this way is taken
-SHARE = 8  # bodies for each impact of a round
-ROUNDS = 4  # for each sweep
-ROUNDING = 64  # [-] of the last digit of the speeds: what closes no faster does not close
-SLOW = 1e-3  # [-] of `rest_speed`, likewise: else bodies that stick would take all rounds
+MANY = 256  # bodies, the least for which this way is taken
+SHARE = 8  # bodies per slot of a round
+ROUNDS = 4  # per sweep
+ROUNDING = 64  # [-] times eps times the speeds: slower closing counts as none
+SLOW = 1e-3  # [-] of `rest_speed`, likewise: else sticking bodies would take all rounds
 
 
 def is_many(kinds: Any, owners: Any, moving: int, alone: bool) -> bool:
-    """Whether pairs of bodies are found by a grid: many, all discs or all spheres, against half-spaces and each other.
+    """Whether pairs are found by a grid: many bodies, all discs or all spheres; statics also half-spaces. Static.
 
     Args:
         kinds: type of each entry of `world.shapes`.
         owners: for each entry, the collider of each of its rows.
-        alone: nothing else acts on them: no forces, joints, friction against rolling, and none pass through others.
+        alone: nothing else acts on them: no forces, joints or rolling friction, and no pairs are excluded.
     """
     entries = [entry for entry, of in enumerate(owners) for owner in of if owner < moving]
     one_each = len(entries) == moving and len(set(entries)) == 1
@@ -54,7 +54,7 @@ def is_many(kinds: Any, owners: Any, moving: int, alone: bool) -> bool:
 
 @pytree
 class Crowd:
-    """The M bodies of all worlds, side by side; what is the same for all has a last axis of 1."""
+    """The M bodies of all worlds, side by side; values that all share have a last axis of 1."""
 
     world: Any  # of one body
     shape: Any
@@ -72,7 +72,7 @@ class Walls:
 
 
 class Encounters(NamedTuple):
-    """The impacts of a round: E bodies, or fewer, and what each meets."""
+    """Impacts of a round: up to E bodies, and what each meets."""
 
     a: Array  # (E,) int
     b: Array  # (E,) int: a body, or from M on a static
@@ -95,7 +95,7 @@ def step_crowd(world: Any, state: State, dt: Array) -> State:
 
 
 def without_room(world: Any, state: State, dt: Array) -> Array:
-    """How many neighbours of the bodies of one crowd there is no room for in a step of dt () [s], ()."""
+    """Number of neighbours, summed over the bodies of one crowd, without room in a step of dt () [s]; ()."""
     near = _near(world, _side_by_side(world, dt), _states(state, ()))
     return jnp.maximum(near.found - len(near.other), 0).sum()
 
@@ -104,7 +104,7 @@ def without_room(world: Any, state: State, dt: Array) -> Array:
 
 
 def _columns(leaf: Array, bodies: bool, count: int, batch: tuple[int, ...]) -> Array:
-    """An array of `bodies` (N, ..., *batch) as (..., M); another (..., *batch) as (..., M), or (..., 1) if alike."""
+    """Reshape an array of `bodies` (N, ..., *batch) to (..., M); others (..., *batch) too, or to (..., 1) if shared."""
     inner, own = leaf.shape[: leaf.ndim - len(batch)], leaf.shape[leaf.ndim - len(batch) :]
     if not bodies:
         if max(own, default=1) == 1:
@@ -115,7 +115,7 @@ def _columns(leaf: Array, bodies: bool, count: int, batch: tuple[int, ...]) -> A
 
 
 def _states(state: State, batch: tuple[int, ...]) -> State:
-    """(1, ..., M)."""
+    """Reshape states to (1, ..., M): one body, and the bodies of all worlds as its batch."""
     return map_arrays(lambda leaf, *_: _columns(leaf, True, len(leaf), batch)[None], state)
 
 
@@ -161,7 +161,7 @@ def _walls(world: Any, batch: tuple[int, ...]) -> list[Walls]:
 
 
 def _near(world: Any, crowd: Crowd, start: State) -> Near:
-    """The neighbours of each body that it can touch within the step, at the speeds of its start."""
+    """Neighbours that each body can touch within the step, at the speeds of its start."""
     fastest = norm(start.v[0]).max()
     x, reach = start.x[0], crowd.shape.radius + fastest * crowd.dt
     return neighbours(x, jnp.broadcast_to(reach, x.shape[1:]), x.shape[1] // len(world.names), world.contact.neighbours)
@@ -171,9 +171,9 @@ def _near(world: Any, crowd: Crowd, start: State) -> Near:
 
 
 def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> Anchors:
-    """The anchors after all rounds; those that nobody needs are left out."""
+    """Anchors after all rounds; rounds that no world needs are skipped."""
 
-    # What a round computes is cheaper to compute again than to save, but for what it searches.
+    # For reverse mode a round is cheaper to recompute than to save, except for its search (FOUND).
     @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
     def one_round(anchors: Anchors) -> tuple[Anchors, Array]:
         flight = jax.tree.map(lambda leaf: leaf[0], launch(crowd.world, anchors.state, None, anchors.t0, crowd.dt))
@@ -190,7 +190,7 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
 
 
 def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Encounters:
-    """The impacts that are next for both their sides, as many as there is room for."""
+    """Impacts that are the next one for both their bodies, as many as there are slots."""
     count, dt = len(near.found), lax.stop_gradient(crowd.dt)
     speed, eps, rest_speed = norm(bodies.flight.v), jnp.finfo(dt.dtype).eps, crowd.world.contact.rest_speed
     rest_speed, tie = lax.stop_gradient(rest_speed), jnp.sqrt(eps) * dt
@@ -201,7 +201,7 @@ def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Encount
         s, _, found, u = approach(bodies, b, None)
         closes = u > jnp.maximum(ROUNDING * eps * speeds, SLOW * rest_speed)
         s = jnp.where(there & found & (s <= dt) & closes, jnp.floor(s / tie), jnp.inf)
-        # At the same time the fastest first, then the lower number: alike for both sides, so that some pair agrees.
+        # At equal times the fastest first, then the lower index: alike for both sides, so that some pair agrees.
         before = (u > fastest) | ((u == fastest) & (number < other))
         better = (s < first) | ((s == first) & (s < jnp.inf) & before)
         return tuple(jnp.where(better, new, old) for new, old in zip((s, u, number), best, strict=True))
@@ -229,7 +229,7 @@ def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Encount
 
 
 def _meet(crowd: Crowd, walls: list[Walls], following: Encounters, bodies: Side, anchors: Anchors) -> Anchors:
-    """The anchors after the impacts of a round."""
+    """Anchors after the impacts of a round."""
     (a, b, there), count = following, anchors.t0.shape[1]
     moves = there & (b < count)
     b = jnp.where(moves, b, (a + 1) % count)  # some other body, where it is a wall
@@ -274,12 +274,12 @@ def _blow(crowd: Crowd, a: Array, side_a: Side, own: list, side_b: Side, others:
 
 
 def _at(tree: Any, index: Array) -> Any:
-    """Of the M bodies those numbered `index` (E,)."""
+    """Gather the bodies `index` (E,) of M; axes of length 1 stay."""
     return jax.tree.map(lambda leaf: pick(leaf, index) if leaf.shape[-1] > 1 else leaf, tree)
 
 
 def _of_rows(tree: Any, row: Array, body: Array) -> Any:
-    """Of statics (R, ..., M or 1) those numbered `row`, as each of the bodies has them, (..., E)."""
+    """Gather from statics (R, ..., M or 1) the `row` of each `body`, (..., E)."""
 
     def chosen(leaf: Array) -> Array:
         many = leaf.shape[-1]

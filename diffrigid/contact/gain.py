@@ -1,13 +1,13 @@
-"""Impacts at several contacts at once, which Newton's law with Coulomb's would let gain energy.
+"""Impacts at several contacts at once, for which Newton's law with Coulomb's could add kinetic energy.
 
 As for one contact (`impulse.py`), P is then taken between the impulses of both laws and P0, those without friction,
-which never gain any:
+which never add any:
 
     P = P0 + kappa Q,   Q = P_both - P0,   T = P . (v_rel + W P / 2) <= 0,   the largest such kappa <= 1
 
-Normal velocities are those of Newton's law on the whole way, and the cone of friction is convex. Contacts that hang
-together through bodies share their kappa. Bodies that are deep inside each other may ask for what no impulses can do:
-then P0 gains as well, and is lessened likewise, from no impulse at all.
+For every kappa the normal velocities are those of Newton's law, and the impulses lie in the cone of friction, which
+is convex. Contacts connected through bodies share one kappa. Bodies that are deep inside each other may demand what
+no impulses can do: then P0 adds energy as well, and is scaled down likewise, towards zero impulse.
 Source: Kane & Levinson, Dynamics: Theory and Applications (1985), for the gain.
 """
 
@@ -27,14 +27,14 @@ from diffrigid.pytree import replace
 
 
 def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms: Arms, mobility: Mobility) -> Array:
-    """Impulses of contacts that share bodies, (C, D, *batch) [N s]; other arguments as of `solve_together`.
+    """Impulses of contacts that share bodies, without energy gain, (C, D, *batch) [N s]; arguments of `solve_together`.
 
-    Differentiable as these are, but where the bound on energy begins to act.
+    Differentiable where these are, except where the bound on energy begins to act.
 
     Args:
         deep: (C, *batch) bool: contacts of bodies that are deep inside each other.
     """
-    # Each number that a loop saves for reverse mode is an operation more, so all but impulses are computed again.
+    # Each number that a loop saves for reverse mode is one more operation, so all but the impulses are recomputed.
     again = saving(FOUND)
     may_gain = jnp.where((cone.target > 0) | deep, cone.on, 0.0)
     if cone.most is not None:
@@ -70,7 +70,7 @@ def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms
         return P0 + kappa[:, None] * both[1], None
 
     def between(P: Array, P0: Array) -> Array:
-        """By way of P0, which gains nothing but where there is no solution."""
+        """Impulses from zero to P0, which adds energy only where there is no solution, and from there towards P."""
         goals = jnp.stack([P0, P]), jnp.array([1.0, 0.0], P.dtype)
         return lax.scan(towards, jnp.zeros_like(P), goals)[0]
 
@@ -80,14 +80,14 @@ def solve_without_gain(cone: Cone, deep: Array, v_rel: Array, guess: Array, arms
 
 
 def _summed(cone: Cone, arms: Arms, mobility: Mobility, *values: Array) -> list[Array]:
-    """Sums of values (C, *batch) over all contacts that hang together with each of them, each (C, *batch)."""
+    """Sums of values (C, *batch) over all contacts connected through bodies with each of them, each (C, *batch)."""
     moving = mobility.inverse_mass.shape[0]
     by_pair = pair_sum(jnp.stack([cone.on, *values], axis=1), arms.a, arms.b)
     number = lax.broadcasted_iota(jnp.int32, (moving, *by_pair.shape[2:]), 0)
     if mobility.matrix is None:
         links = Links(*pairs_of(arms.a, arms.b), tuple((i,) for i in range(moving)))
         label = links.least(hanging_together(by_pair[:, 0] > 0, links), moving)
-    else:  # joints may hold all of them together
+    else:  # joints may connect all of them
         label = jnp.zeros(by_pair[:, 0].shape, jnp.int32)
     member = (label[None] == number[:, None]).astype(by_pair.dtype)
     sums = (member[:, :, None] * by_pair[None]).sum(1)

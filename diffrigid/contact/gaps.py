@@ -1,4 +1,4 @@
-"""How the gaps of a pair change along the paths of its colliders: what a search for their impact looks at."""
+"""Gaps of a pair along the paths of its colliders, and their derivatives, for the search for their impact."""
 
 from typing import NamedTuple
 
@@ -25,14 +25,14 @@ class Gaps(NamedTuple):
 
 
 def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
-    """The gaps of all contacts that an impact may be at, at time s (*batch) [s]."""
+    """Gaps of all candidate contacts at time s (*batch) [s]."""
     at_a, at_b = place(a, s, live), place(b, s, live)
     if isinstance(b.shape, HalfSpace):
         return _gaps_of_corners(a, at_a, b)
     contacts = candidates_of(a, at_a, b, at_b)
 
     def pull(n: Array, p: Array, gap: Array) -> Array:
-        # Of the cores: where they are rounded, other material comes to the contact as they spin.
+        # At the cores: on a rounded surface, other material comes to the contact as it spins.
         at_cores = (p + (0.5 * gap + radius(a.shape))[None] * n, p - (0.5 * gap + radius(b.shape))[None] * n)
         return dot(n, relative_acceleration(at_a, at_b, *at_cores))
 
@@ -41,7 +41,7 @@ def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
 
 
 def _gaps_of_corners(a: Side, at: Placed, b: Side) -> Gaps:
-    """Of all corners of a above a half-space.
+    """Gaps of all corners of a above a half-space.
 
     In body axes the height of a corner r is n . x + N . r with N = R^T n; so are its derivatives, with those of N.
     """
@@ -59,12 +59,12 @@ def _gaps_of_corners(a: Side, at: Placed, b: Side) -> Gaps:
 
 
 def deepest(gap: Array) -> Array:
-    """1 for the least of the gaps (K, *batch), else 0."""
+    """1 for the smallest of the gaps (K, *batch), else 0."""
     return jax.nn.one_hot(jnp.argmin(gap, 0), len(gap), axis=0, dtype=gap.dtype)
 
 
 def at_corners(a: Side, at: Placed, contacts: Contacts, of_corners: Array) -> Array:
-    """What holds of corners of a, (V, *batch) bool, for contacts with a half-space at some of them, (K, *batch)."""
+    """Transfer flags of the corners of a, (V, *batch) bool, to half-space contacts at some of them, (K, *batch)."""
     so, margin = rotations(len(at.x)), NEAR * reach_of(a)
 
     def one(gap: Array, normal: Array, point: Array) -> Array:

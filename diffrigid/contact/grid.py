@@ -1,8 +1,8 @@
-"""Which bodies of a crowd are near each other: a uniform grid, by sorting the numbers of their cells.
+"""Neighbours among the bodies of a crowd, from a uniform grid, by sorting bodies by the index of their cell.
 
-Bodies in order of their cells, the first axis fastest, have those of three neighbouring cells of a row side by side, so
-that what is near a body lies in 3 stretches of that order in 2D, in 9 in 3D. All shapes are static: only how far the
-longest of them is walked depends on where the bodies are. Source: Green, Particle Simulation using CUDA, 2010.
+With the bodies sorted by cell, first axis fastest, those of three adjacent cells of a row are contiguous, so the
+neighbours of a body lie in 3 stretches of that order in 2D, and 9 in 3D. All array shapes are static: only how far
+the stretches are walked depends on positions. Source: Green, Particle Simulation using CUDA, 2010.
 """
 
 import itertools
@@ -14,23 +14,23 @@ from jax import Array, lax
 from diffrigid.branches import any_world
 
 CELLS = 4  # for each body
-SPREAD = 2.5  # [-] standard deviations that the grid reaches to both sides; who is farther counts as on its edge
+SPREAD = 2.5  # [-] half-width of the grid in standard deviations; bodies farther out count as on its edge
 
 
 class Near(NamedTuple):
-    """Who is near each of M bodies, on both sides of a pair."""
+    """Neighbours of each of M bodies; the two of a pair list each other."""
 
-    other: Array  # (E, M) int, numbers of bodies; -1: none. The first of all that there are, if there are more
-    found: Array  # (M,) int, how many there are
+    other: Array  # (E, M) int, indices of bodies; -1: none. Only the first E, if there are more
+    found: Array  # (M,) int, how many there are, also beyond E
 
 
 def neighbours(x: Array, reach: Array, worlds: int, most: int) -> Near:
-    """Bodies less than both their reaches from each other; no derivatives.
+    """Find all bodies closer to each other than the sum of their reaches; no derivatives.
 
     Args:
         x: (D, M) [m] of N bodies of `worlds` worlds, in this order of axes.
         reach: (M,) [m].
-        most: E, for how many others of each body there is room.
+        most: E, capacity of the neighbour list of each body.
     """
     x, reach = lax.stop_gradient((x, reach))
     order, first, ends = _stretches(x, reach, worlds)
@@ -55,7 +55,7 @@ def neighbours(x: Array, reach: Array, worlds: int, most: int) -> Near:
 
 
 def _stretches(x: Array, reach: Array, worlds: int) -> tuple[Array, list[Array], list[Array]]:
-    """The order of the bodies; for each body, where its stretches of it begin, and their lengths added up."""
+    """Order of the bodies by cell; for each body, the beginnings of its stretches, and their cumulative lengths."""
     dim, count = x.shape
     side = int((CELLS * count // worlds) ** (1.0 / dim)) + 1
     mean, deviation = x.mean(1, keepdims=True), x.std(1, keepdims=True)
@@ -78,7 +78,7 @@ def _stretches(x: Array, reach: Array, worlds: int) -> tuple[Array, list[Array],
 
 
 def _in_order(cell: Array, cells: int) -> Array:
-    """Bodies by their cells. Cell and body in one number, if it is not too large, are sorted in a sixth of the time."""
+    """Sort bodies by cell. Cell and body packed into one integer, where it fits, sort much faster."""
     count = len(cell)
     if cells * count >= 2**31:
         return jnp.argsort(cell)
@@ -86,5 +86,5 @@ def _in_order(cell: Array, cells: int) -> Array:
 
 
 def pick(values: Array, index: Array) -> Array:
-    """values[..., index], where each index is one that there is."""
+    """Gather values[..., index]; every index must be in bounds."""
     return values.at[..., index].get(mode="promise_in_bounds", wrap_negative_indices=False)

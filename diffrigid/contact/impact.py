@@ -1,4 +1,4 @@
-"""When two colliders meet within a step, on their true paths, and where.
+"""Time and place at which two colliders meet within a step, on their true paths.
 
 The time is found without derivatives, by a closed form for round shapes and a search for the rest, and then
 given the derivative of the implicit function theorem (`implicit_root`). Everything else, normal, arms and
@@ -44,9 +44,9 @@ def find_impact(
 
     Args:
         t1: (*batch) [s] end of the step.
-        width: (*batch) [m] of the smooth distance; 0 is exact. None: exact, known when tracing.
+        width: (*batch) [m] smoothing width of the distance; 0 is exact. None: exact, known when tracing.
         straight: all bodies have the same acceleration, so relative paths are straight lines.
-        rest_speed: (*batch) [m/s] slower impacts do not move their time with the parameters.
+        rest_speed: (*batch) [m/s] the times of slower impacts have no derivative.
         at_end: bool; True: do not look for an impact, s is t1.
 
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
@@ -66,9 +66,9 @@ def find_impact(
     moved = contacts_of(a, at_a, b, at_b)
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
     closes = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
-    if len(rests) == len(gap) == 1:  # what rests would always meet next when it falls, and hide what else is met
+    if len(rests) == len(gap) == 1:  # as it falls, a resting contact would always be next, and hide others
         closes = closes & ~rests
-    # What rested has fallen below its level since, and has no part in when the others come to theirs.
+    # A contact that rested has sunk below its level meanwhile; it does not affect when the others reach theirs.
     there = closes & (gap >= (lax.stop_gradient(level) - slack)[None])
     struck = jnp.where(there.any(0)[None], there, closes).astype(s0.dtype)
     share = struck / jnp.maximum(struck.sum(0), 1.0)[None]
@@ -79,7 +79,7 @@ def find_impact(
     at_once = jnp.any(closes & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
     s = jnp.where(at_once, begin, s)
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
-    if len(rests) != len(gap):  # contacts are some of many places: of the corners of a box, or of those of a grid
+    if len(rests) != len(gap):  # contacts are a selection: of the corners of a box, or of places on a grid
         few = isinstance(b.shape, HalfSpace)
         rests = at_corners(a, at_a, moved, rests) if few else jnp.broadcast_to(rests.any(0), gap.shape)
     elif isinstance(b.shape, Profile):
@@ -100,12 +100,12 @@ def _round_rests(a: Side, b: Side, start: Array, rest_speed: Array) -> Array:
 
 
 def approach(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:
-    """Where it has a closed form: time of the impact (no gradient), level of the gap, whether there is one, speed."""
+    """Impact in closed form: its time (no gradient), level of the gap, whether there is one, closing speed."""
     return _approach_parabola(a, b, width) if isinstance(b.shape, HalfSpace) else _approach_straight(a, b, width)
 
 
 def closed_form(a: Shape, b: Shape, straight: bool) -> bool:
-    """Whether the impact time of two shapes has a closed form, where all bodies fall alike (`straight`) or not."""
+    """Whether the impact time of two shapes has a closed form; `straight`: relative paths are straight lines."""
     return isinstance(a, Disc | Sphere) and (isinstance(b, HalfSpace) or (isinstance(b, Disc | Sphere) and straight))
 
 

@@ -34,8 +34,8 @@ JAMMED = 1e-3  # [-] of the normal mobility: sliding would close the contact as 
 def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -> Array:
     """Coefficient of restitution of an impact with closing speed u [m/s], e = restitution (1 + falloff u)^(-1/4).
 
-    The power is that of impacts in which the material yields, whatever the solid: e ~ u^(-1/4). Slow ones have the
-    whole restitution. Without falloff [s/m], or with 0, it is constant. All (*batch); smooth.
+    The power is that of impacts in which the material yields, whatever the solid: e ~ u^(-1/4). Slow impacts have the
+    full restitution. Without falloff [s/m], or with 0, it is constant. All (*batch); smooth.
     Source: Johnson, Contact Mechanics (1985), 11.5.
     """
     if falloff is None:
@@ -44,18 +44,18 @@ def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -
 
 
 def comes_to_rest(u: Array, rebound: Array, closing_acc: Array, left: Array, rest_speed: Array) -> Array:
-    """Whether an impact does not rebound, (*batch) bool: because it is slow, or would meet again within the step.
+    """Whether an impact does not rebound, (*batch) bool: it is slow, or the bodies would meet again within the step.
 
     Args:
-        u, rebound: [m/s] speed of closing, and that of parting, e u, by the law of restitution.
+        u, rebound: [m/s] closing speed, and separation speed e u by the law of restitution.
         closing_acc: [m/s^2] acceleration at which the bodies close: after 2 rebound / closing_acc they are back.
-        left: [s] of the step.
+        left: [s] remaining time of the step.
     """
     return (u <= rest_speed) | (2.0 * rebound <= closing_acc * left)
 
 
 def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
-    """K, (D, D, *batch) [1/kg]: change of the relative velocity, at the arms of the end, for a unit impulse there."""
+    """K, (D, D, *batch) [1/kg]: change of relative velocity at the end arms for a unit impulse at the middle arms."""
     K: Any = 0.0
     for at, arm, mid in ((at_a, lever.arm_a, lever.mid_a), (at_b, lever.arm_b, lever.mid_b)):
         if at.v is not None:
@@ -99,10 +99,10 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
 
 
 def _in_contact_frame(K: Array, n: Array) -> tuple[list[Array], list[list[Array]], Array]:
-    """n and its unit tangents; K along them, over its normal component; and the inverse of that, the effective mass.
+    """Basis of n and unit tangents; K in it, divided by its normal component; the inverse of that, the effective mass.
 
-    Impulses are velocities [m/s] then, until they are multiplied by the effective mass: products of components of K
-    itself are beyond single precision where bodies weigh milligrams.
+    Impulses are then velocities [m/s] until they are multiplied by the effective mass: products of components of K
+    itself exceed the range of single precision where bodies weigh milligrams.
     """
     basis = [n, perp(n)] if n.shape[0] == 2 else [n, *tangents(n)]
     moved = [matvec(K, e) for e in basis]
@@ -112,10 +112,10 @@ def _in_contact_frame(K: Array, n: Array) -> tuple[list[Array], list[list[Array]
 
 
 def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array) -> list:
-    """What friction adds to the impulse gamma n, in the contact frame. It leaves the normal velocity.
+    """Impulse that friction adds to gamma n, in the contact frame; the normal velocity is unchanged.
 
     Args:
-        k, gamma: see `_in_contact_frame`; so is the result.
+        k, gamma: scaled as in `_in_contact_frame`, like the result.
         slip: tangential velocity after gamma n [m/s].
     """
     stop = _stopping_impulse(k, slip)
@@ -149,7 +149,7 @@ def _stopping_impulse(k: list, slip: list) -> list:
 
 
 def sticking_impulse(K: Array, n: Array, slip: Array) -> Array:
-    """The impulse (D, *batch) [N s] that stops a slip (D, *batch) [m/s] and leaves the normal velocity."""
+    """Impulse (D, *batch) [N s] that stops a slip (D, *batch) [m/s] and leaves the normal velocity unchanged."""
     basis, k, effective_mass = _in_contact_frame(K, n)
     P = _stopping_impulse(k, [dot(e, slip) for e in basis[1:]])
     return sum((effective_mass * P_i)[None] * e for P_i, e in zip(P, basis, strict=True))
@@ -157,7 +157,7 @@ def sticking_impulse(K: Array, n: Array, slip: Array) -> Array:
 
 def within_energy(T0: Array, b: Array, c: Array) -> Array:
     """Largest kappa <= 1 for which the kinetic energy does not rise: T0 + b kappa + c kappa^2 / 2 <= 0."""
-    scale = lax.stop_gradient(jnp.abs(T0) + jnp.abs(b) + jnp.abs(c))  # of any unit: the squares of joules may underflow
+    scale = lax.stop_gradient(jnp.abs(T0) + jnp.abs(b) + jnp.abs(c))  # normalised: squares of joules may underflow
     T0, b, c = (safe_divide(term, scale) for term in (T0, b, c))
     gains = (T0 + b + 0.5 * c > 0) & (c > 0)
     root = (safe_sqrt(b * b - 2.0 * c * jnp.minimum(T0, 0.0)) - b) / jnp.where(gains, c, 1.0)

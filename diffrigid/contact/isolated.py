@@ -1,11 +1,11 @@
 """Impacts of round shapes that are alone on their bodies: the usual step of a world of many discs or spheres.
 
 The general pass evaluates every contact of every pair. Here only the *times* are found for all pairs, without
-derivative, and each body keeps its next one. The impacts of each world then go into `slots`, a few at a time, and
+derivatives, and each body keeps its next one. The impacts of each world then go into `slots`, a few at a time, and
 only these are evaluated.
 
 A pass goes this way if it is an impact pass and, in all worlds of the batch, no body is in two contacts at the
-same time, none comes to rest, and the slots suffice; else the general way, to the same result.
+same time, none comes to rest, and the slots suffice; else the general way, with the same result.
 """
 
 import functools
@@ -30,10 +30,10 @@ from diffrigid.numerics import dot
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
-RESTS = -1e30  # [s] stands for an impact after which bodies stay together
+RESTS = -1e30  # [s] marks an impact after which the bodies stay together
 CROWDED = 4  # pairs per body from which this way is faster than the list of pairs
 SHARE = 8  # bodies for each slot of a round
-ROUNDS = 3  # in which the impacts of a pass are taken; most need one, and reverse mode pays for each
+ROUNDS = 3  # at most, for the impacts of a pass; most passes need one, and reverse mode pays for each
 
 
 def goes_in_rounds(world: Any) -> bool:
@@ -51,7 +51,7 @@ def goes_in_rounds(world: Any) -> bool:
 
 
 def tables_of(world: Any) -> tuple[Table, ...]:
-    """The tables that hold all pairs of a crowded world."""
+    """Tables of all pairs of a crowded world."""
     moving = len(world.names)
 
     def table(pairs: PairGroup) -> Table:
@@ -69,8 +69,8 @@ def tables_of(world: Any) -> tuple[Table, ...]:
 class Next(NamedTuple):
     """The next impact of each body in this step: into which slot of its world it goes, and with what."""
 
-    lead: Array  # (N, *batch) 1 for a body that has a slot, of two the first; else 0
-    rank: Array  # (N, *batch) number of that slot
+    lead: Array  # (N, *batch) 1 for a body that has a slot, of two bodies the first; else 0
+    rank: Array  # (N, *batch) index of that slot
     other: Array  # (N, *batch) the other collider, a body or a static
 
 
@@ -78,8 +78,8 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
     """The next impact of each body, if any.
 
     Returns:
-        next impacts; whether the slots hold them and all are isolated, exact and do not rest, a bool; how many slots
-        the fullest world needs.
+        next impacts; whether the slots suffice and all impacts are isolated, exact and with rebound, a bool; how many
+        slots each world needs.
     """
     moving, live = len(world.names), opaque_true(dt)
     tie = (jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt)[None]
@@ -90,7 +90,7 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
         return functools.reduce(jnp.minimum, soonest)
 
     def with_what(times, first):
-        """Number of the collider that a body meets first; `many` and more if it meets two then."""
+        """Index of the collider that a body meets first; `many` or more if it meets two then."""
         total = jnp.full_like(first, -many)
         for table, t in zip(tables, times, strict=True):
             for k, b in enumerate(table.b):
@@ -103,7 +103,7 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
         alone = fold(jnp.logical_and, ~hit | ((other < many) & (first > RESTS)), 0)
         return lead, jnp.where(hit, other, -1.0), ~alone
 
-    # Apart: times are compared with each other, and must not be computed twice with another rounding.
+    # Not fused: times are compared with each other, and must not be computed twice with different rounding.
     times = [_times(live, world, table, flight, since, dt) for table in tables]
     first = unfused(live, first_of, times)
     lead, other, crossed = unfused(live, in_slots, first, unfused(live, with_what, times, first))
@@ -118,7 +118,7 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
 def meet_in_rounds(
     world: Any, tables: tuple[Table, ...], following: Next, needed: Array, anchors: Anchors, launch: Any, dt: Array
 ) -> Anchors:
-    """The anchors after the next impact of each body; rounds that no world needs are left out."""
+    """Anchors after the next impact of each body; rounds that no world needs are skipped."""
     count, live = slots_of(len(world.names)), opaque_true(dt)
 
     @jax.checkpoint
@@ -133,12 +133,12 @@ def meet_in_rounds(
 
 
 def slots_of(moving: int) -> int:
-    """Slots of a round."""
+    """Number of slots of a round."""
     return -(-moving // SHARE)
 
 
 def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Array, live: Array) -> Slots:
-    """The impacts of a round as slots: those numbered from `begin`, which both bodies have as their next one."""
+    """Fill the slots of a round with the impacts from index `begin` on that are the next one for both bodies."""
     moving = len(following.rank)
 
     def weights(following: Next) -> Array:
@@ -175,7 +175,7 @@ def _times(live: Array, world: Any, table: Table, flight: Flight, since: Array, 
 
 
 def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Array) -> Array:
-    """Time of the next impact of each body with each other, (N, N, *batch) [s]: `meet_on_line`, without derivative."""
+    """Time of the next impact of each two bodies, (N, N, *batch) [s]: `meet_on_line`, without derivatives."""
 
     def at_start(flight: Flight) -> tuple[Array, Array]:
         zero = jnp.zeros_like(flight.t0)

@@ -1,11 +1,11 @@
-"""Impulses that a pass knows from the one before it, and that the others are solved beside.
+"""Impulses that a pass knows from the one before it; the others are solved beside them.
 
 Friction that reverses   Where a slip stops and reverses while the contact is held, friction acts first one way, then
                          the other. A trial pass, with friction one way, tells the total; the trial is discarded, and
                          the next pass uses the total.
 Loads                    A loaded contact must not move, in either direction. The displacement by its load is taken
-                         back, and found anew with all gaps closed: so a gap closes that opened beside another contact
-                         when the body turned within the step.
+                         back, and found anew with all gaps closed: this closes a gap that opened beside another
+                         contact when the body turned within the step.
 """
 
 from typing import Any
@@ -22,15 +22,15 @@ from diffrigid.contact.slipping import in_all, least_slip, most_resisting, rubbi
 from diffrigid.numerics import dot, norm, normalise, safe_divide
 from diffrigid.pytree import array, pytree, replace
 
-TELLS = 0.5  # [-] share from which a trial tells how friction brakes a slip
+TELLS = 0.5  # [-] share of friction along the slip from which a trial tells how friction brakes it
 
 
 @pytree
 class Known:
-    """Impulses that are known, on body a of each contact and row; else 0."""
+    """Known impulses on body a of each contact and row; else 0."""
 
-    P: Array = array("C", "D")  # [N s]; where gaps are closed [kg m]
-    early: Array = array("C", "D")  # [N s^2] what they move bodies by beside an even force: where friction reverses
+    P: Array = array("C", "D")  # [N s]; where gaps are closed (PUSH) [kg m]
+    early: Array = array("C", "D")  # [N s^2] displacement beyond that of an even force, where friction reverses
     rubs: Array = array("C")  # 1 where friction reverses, so that all of it is known, else 0
 
     def reverses(self) -> Array:
@@ -46,7 +46,7 @@ class Known:
 
 
 def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tuple[Strikes, Law]:
-    """Strikes and law of the impulses that are not known. Friction that is known acts no more."""
+    """Strikes and law for the unknown impulses: known ones are in `v_rel`, and known friction is switched off."""
     (target, mu, most), rubs = law, known.rubs > 0
     most = None if most is None else jnp.where(rubs & jnp.isfinite(most), 0.0, most)
     strikes = replace(strikes, v_rel=strikes.v_rel + moved(known.P, strikes, mobility))
@@ -56,11 +56,11 @@ def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tupl
 def reversing(
     mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array
 ) -> Known:
-    """Friction where a slip stops and goes back within T, from impulses P that take it to act one way.
+    """Friction where a slip stops and reverses within T, from trial impulses P with friction acting one way.
 
-    Until the stop, at a share of T, it acts one way with all of its bound, from then on the other, evenly: the sum is
-    (1 - 2 share) of the second, and moves the contact by share (1 - share) T of it less. Exact for one direction of
-    slip under a constant pull.
+    Until the stop, at a share of T, friction acts one way with its full bound, from then on the other way, evenly: the
+    sum is (1 - 2 share) of the second, and moves the contact less, by share (1 - share) T of it. Exact for one
+    direction of slip under a constant pull.
 
     Args:
         changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P.
@@ -76,8 +76,8 @@ def reversing(
             -jax.vmap(dot)(r, back) for r in (slip, friction(relative_changes(strikes, *changes)), rubbed)
         )
         stops = held & (against > least_slip(T.dtype))
-        # How all of the bound brakes the slip, by what those impulses do, if that tells: where friction at all contacts
-        # is about along it, and brakes as much as the heaviest mass allows.
+        # How the full bound brakes the slip, inferred from those impulses if they tell: where friction at all contacts
+        # is roughly along it, and brakes as much as the heaviest mass allows.
         across = jax.vmap(norm)(rubbed + own[:, None] * back)
         rubs, bound, aside = (in_all(strikes, stops, part) for part in (own, bounds, across))
         tells = stops & (jnp.abs(rubs) > TELLS * aside + jnp.finfo(T.dtype).eps ** 0.5 * bound)
@@ -100,7 +100,7 @@ def reversing(
 
 
 def loads(strikes: Strikes, P: Array, most: Array | None, T: Array) -> Array:
-    """What undoes the displacement by the loads of contacts that are held for T, (C, D, *batch) [kg m]."""
+    """Corrections (C, D, *batch) [kg m] that cancel the displacement by the load of each contact held for T."""
     carries: Any = strikes.held if most is None else strikes.held & jnp.isinf(most)
     pushed = jnp.where(carries, 0.5 * T * jnp.maximum(split(strikes.normal, P)[0], 0.0), 0.0)
     if strikes.spin is not None:

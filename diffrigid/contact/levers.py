@@ -1,9 +1,9 @@
-"""Where a contact acts on its two bodies: at the end of the time that it is held for, and in the middle of it.
+"""Lever arms of a contact on its two bodies, at the end and at the middle of the time for which it is held.
 
 A resting force acts evenly over that time T, so its impulse acts in the middle, when the contact was at p - (T/2) p',
-the bodies at x - (T/2) v, and the normal was n - (T/2) n'. With the arms and the normal of that moment angular momentum
-is kept. The velocity that it must cancel is that at the end, along the normal of the end. With the geometry of the end
-for both, what tips over, or slides over a round body, would be of first order only.
+the bodies at x - (T/2) v, and the normal was n - (T/2) n'. The arms and the normal of that moment conserve angular
+momentum. The velocity that the impulse must cancel is that at the end, along the normal at the end. With the geometry
+of the end for both, tipping, or sliding over a round body, would be of first order only.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ from diffrigid.state import rotations
 
 @pytree
 class Levers:
-    """Arms of one contact from the centres of mass of a and b, (D, *batch) [m], world axes."""
+    """Lever arms of one contact from the centres of mass of a and b, (D, *batch) [m], world axes."""
 
     arm_a: Array = array("D")  # at the end
     arm_b: Array = array("D")
@@ -35,14 +35,14 @@ class Levers:
 def levers(
     contact: Contacts, moving: Contacts | None, turns: bool, at_a: Placed, at_b: Placed, drift: Array, T: Array
 ) -> Levers:
-    """Levers of one contact.
+    """Lever arms of one contact.
 
     Args:
-        contact: one of a pair, with the gap that it has closed by while it was held, else 0.
-        moving: its rates. None: all arms are those in the middle, of a point that moves as the centres do in the mean.
+        contact: one of a pair, with its gap if it is held, else with gap 0.
+        moving: its rates. None: all arms are those in the middle, of a point that moves with the mean of both centres.
         turns: whether the normal may turn.
-        drift: (D, *batch) [m/s] half the velocity of a against b, of the centres; 0 at a static.
-        T: (*batch) [s] for which it is held, else 0.
+        drift: (D, *batch) [m/s] half the velocity of centre a relative to centre b; 0 at a static.
+        T: (*batch) [s] time for which it is held, else 0.
     """
     normal, point, gap = contact.normal, contact.point, contact.gap
     inside = 0.5 * gap[None] * normal
@@ -56,7 +56,7 @@ def levers(
     rate = moving.point + 0.5 * sign * moving.gap[None] * normal
     turned = half * (rate - (at_b.v if at_a.v is None else at_a.v - drift))
     size: Any = sum(dot(arm, arm) for arm, at in zip(ends, (at_a, at_b), strict=True) if at.v is not None)
-    # No further than arms are long: a body that turns faster than steps resolve must not flip them.
+    # Limited to the length of the arms: a body that turns faster than the steps resolve must not flip them.
     turned = safe_divide(size, size + 4.0 * dot(turned, turned))[None] * turned
     turn = None
     if turns:
@@ -66,7 +66,7 @@ def levers(
 
 
 def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tuple[Contacts, Contacts]:
-    """The contacts of a pair, and their rates: how the surfaces move where they meet. For `live` see `unfused`."""
+    """Contacts of a pair, and their time derivatives at the bodies' velocities. For `live` see `unfused`."""
     so = rotations(at_a.x.shape[0])
     poses = [(at.x, at.q) for at in (at_a, at_b)]
     rates = [
@@ -85,10 +85,10 @@ def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tup
 
 
 def acceleration(side: Side, at: Placed, s: Array, arm: Array, rate: Array | None) -> Array | None:
-    """Of a collider where its contact is, from its anchor to s, (D, *batch) [m/s^2], in the mean.
+    """Mean acceleration of the contact point on this collider from its anchor to s, (D, *batch) [m/s^2]; None: static.
 
     Args:
-        rate: (D, *batch) [m/s] velocity of the point of contact; None: as that of the centre.
+        rate: (D, *batch) [m/s] velocity of the contact point; None: that of the centre.
     """
     f = side.flight
     if f is None:

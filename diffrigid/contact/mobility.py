@@ -1,4 +1,8 @@
-"""From impulses at contacts to changes of the bodies' velocities and back: J, G and J G J^T of `together`."""
+"""From impulses at contacts to changes of the bodies' velocities and back: J, G and J G J^T of `together`.
+
+R has two meanings here: in `Arms`, and in `_first`, the rows of joints; in `Mobility.matrix`, and of stacked twists,
+the N (D + A) components of the twists of all bodies, body after body.
+"""
 
 import functools
 from collections.abc import Callable
@@ -21,21 +25,21 @@ from diffrigid.state import rotations
 
 @pytree
 class Arms:
-    """Where C contacts act on their bodies; fields as in `Strikes`, which will do as well.
+    """Where C contacts act on their bodies; fields as in `Strikes`, which may be passed instead.
 
-    The last R of them, those that `jac` is of, are rows along coordinates of joints: the first component of their
-    velocities is the rate of a coordinate, that of their impulses acts along it, and they have no others.
-    With `spin`, the K rows behind the K contacts turn: their velocities are w_a - w_b, their impulses torques; in 2D
-    these are the first components.
+    The last R of them, those of `jac`, are rows along coordinates of joints: the first component of their velocities is
+    the rate of a coordinate, that of their impulses acts along it, and the other components are zero.
+    With `spin`, the K rows behind the K contacts are rolling rows: their velocities are w_a - w_b, their impulses are
+    torque impulses; in 2D these are the first components.
     """
 
     arm_a: Array = array("C", "D")
     arm_b: Array = array("C", "D")
     mid_a: Any = array("C", "D", default=None)  # where impulses act; None: where velocities are, at the arms
     mid_b: Any = array("C", "D", default=None)
-    turn: Any = array("C", "A", default=None)  # [rad] by which they act turned
-    jac: Any = array("R", "2", "D + A", default=None)  # of each coordinate by the twists of a and b
-    mid_jac: Any = array("R", "2", "D + A", default=None)  # when its impulse acts
+    turn: Any = array("C", "A", default=None)  # [rad] rotation of the impulses to where they act
+    jac: Any = array("R", "2", "D + A", default=None)  # Jacobian of each joint coordinate for the twists of a and b
+    mid_jac: Any = array("R", "2", "D + A", default=None)  # the same at the time when its impulse acts
     spin: Any = array("K", default=None)
     a: tuple[int, ...] = static()
     b: tuple[int, ...] = static()
@@ -43,11 +47,11 @@ class Arms:
 
 @pytree
 class Mobility:
-    """What turns impulses on the N moving bodies into changes of velocity."""
+    """G, the map from impulses on the N moving bodies to changes of their velocities."""
 
     inverse_mass: Array = array("N")  # [1/kg]
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
-    matrix: Any = array("R", "R", default=None)  # G whole, where there are joints: twists (D + A) of body after body
+    matrix: Any = array("R", "R", default=None)  # all of G, where there are joints; R = N (D + A), body after body
     inertia: Any = None  # [kg m^2] world axes; with `matrix` only
     joined: frozenset[int] = static(default=frozenset())  # bodies that have a joint
 
@@ -81,7 +85,7 @@ def momentum_changes(arms: Any, P: Array, moving: int) -> tuple[Array, Array]:
 
 
 def mids(arms: Any) -> tuple[Array, Array]:
-    """Where impulses act on bodies a and b, (C, D, *batch) [m]."""
+    """Arms at which impulses act on bodies a and b, (C, D, *batch) [m]."""
     return (arms.arm_a, arms.arm_b) if arms.mid_a is None else (arms.mid_a, arms.mid_b)
 
 
@@ -92,11 +96,11 @@ def _joined(parts: list[Array]) -> Array:
 def jointed(
     joints: tuple, link: Linkage, then: Linkage, ago: Array, inertia: Array, joined: frozenset[int]
 ) -> Mobility:
-    """Of bodies some of which are `joined`, with inertias in world axes.
+    """Mobility of bodies connected by joints: the full matrix G. Inertias are in world axes.
 
-    An impulse is answered by the joints as they are when it acts, `then`, the time `ago` (N, *batch) [s] before the
-    end; by their damping since; and by those at the end, `link`. With one answer a force that acts evenly over a step,
-    in its middle, would be of first order only. G is used so often that it is made once, column by column.
+    The joints react to an impulse as they are when it acts, `then`, the time `ago` (N, *batch) [s] before the end; by
+    their damping since; and as they are at the end, `link`. With one reaction only, a force that acts evenly over a
+    step, in its middle, would be of first order only. G is used so often that it is made once, column by column.
     """
     moving, *batch = link.inverse_mass.shape
     D, size = link.groups[0].a.x.shape[1], link.sides.shape[3]
@@ -119,13 +123,13 @@ def jointed(
 
 
 def free(link: Linkage) -> Mobility:
-    """Of its bodies without their joints."""
+    """Mobility of the bodies without their joints."""
     return Mobility(inverse_mass=link.inverse_mass, inverse_inertia=link.inverse_inertia)
 
 
 @jax.jit
 def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, Array]:
-    """Changes of v [m/s], w [rad/s] and L by impulses dp and dL on the bodies, and by what the joints make of them."""
+    """Changes of v [m/s], w [rad/s] and L by impulses dp and dL on the bodies and the reactions of the joints."""
     apply = rotations(dp.shape[1]).apply
     if mobility.matrix is None:
         return mobility.inverse_mass[:, None] * dp, jax.vmap(apply)(mobility.inverse_inertia, dL), dL
@@ -136,7 +140,7 @@ def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, 
 
 @jax.jit
 def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
-    """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies'."""
+    """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies' velocities."""
     if min(arms.b) >= len(dv):  # with statics only
         return _at_ends(arms, 0, dv, dw)
     if min(arms.a) >= len(dv):
@@ -163,7 +167,7 @@ def _rows(arms: Any) -> int:
 
 
 def _points(arms: Any) -> int:
-    """Contacts, without rows that turn and those of joints."""
+    """Number of contacts, without rolling rows and rows of joints."""
     return len(arms.a) - _rows(arms) if arms.spin is None else len(arms.spin)
 
 
@@ -185,25 +189,25 @@ def moved(P: Array, arms: Any, mobility: Mobility) -> Array:
 
 @jax.jit
 def twists(P: Array, arms: Any, mobility: Mobility) -> Array:
-    """G J^T P: the change of the twists of all bodies by impulses, (R, *batch)."""
+    """G J^T P: stacked changes of the twists of all bodies by impulses, (R, *batch)."""
     return _twists(mobility, *momentum_changes(arms, P, mobility.inverse_mass.shape[0]))
 
 
 def _twists(mobility: Mobility, dp: Array, dL: Array) -> Array:
-    """The same by impulses dp (N, D, *batch) [N s] and dL (N, A, *batch) [N m s] on the bodies."""
+    """Stacked twist changes, (R, *batch), by impulses dp (N, D, *batch) [N s] and dL (N, A, *batch) [N m s]."""
     return jnp.concatenate(velocities(mobility, dp, dL)[:2], axis=1).reshape(-1, *dp.shape[2:])
 
 
 @jax.jit
 def at_contacts(arms: Any, twist: Array) -> Array:
-    """J u: `relative_changes` for the twists of all bodies in one, (R, *batch)."""
+    """J u: `relative_changes` (C, D, *batch) for the stacked twists of all bodies, (R, *batch)."""
     D = arms.arm_a.shape[1]
     by_body = twist.reshape(-1, D + rotations(D).A, *twist.shape[1:])
     return relative_changes(arms, by_body[:, :D], by_body[:, D:])
 
 
 def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
-    """1 + G J^T A J, (R, R, *batch) with R components of the twists of all bodies.
+    """1 + G J^T A J, (R, R, *batch), with R the components of the stacked twists of all bodies.
 
     Args:
         answer: the linear map A, contact by contact: impulses (C, D, *batch) for relative velocities.
@@ -229,14 +233,14 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     if arms.turn is not None:  # P + turn x P, by the velocities that it acts on
         mid_a, mid_b = (J - jax.vmap(jax.vmap(so.cross, (None, 0)))(arms.turn, J) for J in (mid_a, mid_b))
 
-    def answers(J):  # of each contact to unit twists of one of its bodies: impulses
+    def answers(J):  # impulses of each contact for unit twists of one of its bodies
         return jnp.swapaxes(jax.vmap(answer)(jnp.swapaxes(J, 0, 1)), 0, 1)
 
     def block(J, back):  # J^T back, (C, size, size)
         each = jax.vmap(jax.vmap(dot, (None, 0)), (0, None))
         return jax.vmap(each)(J, back)
 
-    if batch:  # else XLA computes them again for every twist of the other side
+    if batch:  # else XLA recomputes them for every twist of the other side
         answers = functools.partial(unfused, opaque_true(arms.arm_a), answers)
     back_a, back_b = answers(J_a), answers(J_b)
     own = side_sum(block(mid_a, back_a), block(mid_b, back_b), arms.a, arms.b, moving)

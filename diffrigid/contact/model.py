@@ -1,16 +1,16 @@
 """`Contact`: from the free flight of a step to the state at its end, in passes over one list of contacts.
 
-    IMPACT, as often as `sweeps`   the next impact of every body, at its true time, with restitution; before it what
-                                   rests is held until then (`order.py`)
-    HOLD                           what rests, at the end of the step: the velocities must not close
+    IMPACT, up to `sweeps` times   the next impact of every body, at its true time, with restitution; resting contacts
+                                   are held until then (`order.py`)
+    HOLD                           resting contacts, at the end of the step: their normal velocities must not close
     REVERSE                        instead of HOLD where a slip stops and reverses within the step (`known.py`)
-    PUSH                           what rests: gaps that rounding or turning left are closed; momenta are kept,
+    PUSH                           resting contacts: gaps left by rounding or rotation are closed; momenta are kept,
                                    energy to the order of the gap
 
-Every pass finds contacts at a time, solves for impulses, and anchors the struck bodies anew (`apply.py`); they differ
-in the time, the target of the law, and in how long the impulse has acted. A pass that no world of the batch
-needs is skipped, and so are all where nothing comes near. An impact that the sweeps leave over is found late by the
-next step, with a negative time, and repaired.
+Every pass finds contacts at a time, solves for impulses, and re-anchors the struck bodies (`apply.py`); passes differ
+in that time, the target of the contact law, and how long the impulse has acted. A pass that no world of the batch
+needs is skipped, and so are all passes where no bodies come near each other. An impact beyond the sweeps is found by
+the next step, at a negative time, and repaired.
 """
 
 import functools
@@ -50,23 +50,22 @@ from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
 
 IMPACT, HOLD, REVERSE, PUSH = 0, 1, 2, 3
-HOLDS = 2  # passes until the first impact of what rests: one to where it would be in free fall, one from there
+HOLDS = 2  # passes to hold resting contacts until the first impact: one to its time in free fall, one from there
 
 
 @pytree
 class Contact:
-    """The one contact model. Restitution and friction belong to the bodies; what is numerical is here.
+    """The contact model. Restitution and friction belong to the bodies; the numerical settings are here.
 
     Args:
-        width: (*batch) [m] 0 is exact. Positive: smooth collision impulses, for paths that just miss as well. A
+        width: (*batch) [m] 0 is exact. Positive: smooth collision impulses, also for paths that narrowly miss. A
             traced number: anneal it to zero without recompiling.
         rest_speed: (*batch) [m/s] slower impacts do not rebound (at the limits of a hinge: this number in rad/s). Nor
-            does a faster one after which the bodies would meet again before the step ends: they come to rest on each
+            do faster ones after which the bodies would meet again before the step ends: they come to rest on each
             other.
         sweeps: largest number of successive impacts of a body within a step. Later ones are found, and repaired, in
             the next step. A step that does not need its sweeps skips them; in a gradient each costs memory traffic.
-        neighbours: for how many others near a body there is room, in a crowd of 256 bodies and more: see
-            `missed_pairs`.
+        neighbours: capacity of the neighbour list of a body, in a crowd of 256 bodies or more: see `missed_pairs`.
 
     Differentiable at width > 0 wherever the paths are; at width = 0 with kinks where an impact appears or
     vanishes (grazing), where two coincide, and where sticking turns to slipping.
@@ -105,12 +104,12 @@ class Contact:
 
     def _passes(self, world: Any, start: Anchors, launch: Callable, dt: Array) -> Anchors:
         """The anchors after all passes."""
-        always = driven(world)  # what acts in every step, and needs no impact before
+        always = driven(world)  # acts in every step, without an impact before
         resting = jnp.broadcast_to(flags(always, start.t0), (len(always), *start.t0.shape[1:]))
 
         tables = tables_of(world) if goes_in_rounds(world) else ()
-        # What a pass computes is cheaper to compute again than to save, and to compile, but for what it searches. That
-        # is not saved of a pass that is rarely needed: in all other steps it would be as many zeros.
+        # For reverse mode a pass is cheaper to recompute than to save, and compiles faster so, except for its searches
+        # (FOUND). With tables the general pass is rarely needed, and these are not saved: they would mostly be zeros.
         again = saving(*(FOUND,) * (not tables))
 
         @again
@@ -147,7 +146,7 @@ class Contact:
         return [IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH]
 
     def saved_numbers(self, world: Any) -> int:
-        """About how many numbers reverse mode has to save of a step (FOUND, PASSED) to compute none of it again."""
+        """Approximate count of numbers saved per step (FOUND, PASSED) for reverse mode without recomputing the step."""
         if not ends(world)["a"]:
             return 0
         of_bodies = (6 * world.dim - 3) * len(world.names)  # their states, and times
@@ -156,17 +155,17 @@ class Contact:
 
 
 def _rows(world: Any) -> int:
-    """Contacts, rows of joints, and those of contacts against turning. Static."""
+    """Number of rows: contacts, rolling rows, and rows of joints. Static."""
     return len(driven(world)) + is_rolling(world) * contact_count(world)
 
 
 class Progress(NamedTuple):
-    """What passes hand on."""
+    """State handed from pass to pass."""
 
     anchors: Anchors
     resting: Array  # (C, *batch) bool: contacts that rest
     known: Known | None
-    found: Array  # bool: the pass before had something to do in some world
+    found: Array  # bool: the pass before had active contacts in some world
     rests: Array  # (*batch) bool: some contact of a world rests
 
 
@@ -176,7 +175,7 @@ def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) 
     flight = launch(anchors.state, anchors.t0)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting)
     opened = jnp.zeros(dt.shape, bool) if known is None else push & known.opened(strikes)
-    # Where nothing rests nothing is held at the end: a world that were alone would not pass through here.
+    # A world without resting contacts holds none at the end: on its own it would skip this pass.
     strikes = replace(strikes, gap=_closed(strikes, opened), held=strikes.held & (impact | rests)[None])
     strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
     if known is not None:
@@ -202,7 +201,7 @@ def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) 
 
 
 def _closed(strikes: Strikes, opened: Array) -> Array:
-    """Gaps (C, *batch) [m]: what rounding opened is closed, unless a world is `opened`, but moves as any other."""
+    """Gaps (C, *batch) [m], zero where only rounding opened them (unless the world is `opened`); derivatives kept."""
     closed = (strikes.gap > 0) & (strikes.gap <= strikes.rounding) & ~opened[None]
     return jnp.where(closed, strikes.gap - lax.stop_gradient(strikes.gap), strikes.gap)
 
@@ -210,10 +209,10 @@ def _closed(strikes: Strikes, opened: Array) -> Array:
 def _demanded(
     world: Any, anchors: Anchors, flight: Flight, strikes: Strikes, resting: Array, dt: Array, phase: Array
 ) -> tuple[Strikes, Law, Array, Array]:
-    """What contacts demand in a pass: which take part, their law, for how long [s] they are held, and which rest.
+    """Contacts that take part in a pass, their law, for how long [s] they are held, and which contacts rest.
 
-    Struck is a contact whose turn it is: its normal velocity is to be restitution times that of closing, or 0 if it
-    comes to rest. Held is one that rests: it is not to close, but may where its gap is open.
+    A contact is struck when it is its turn: its normal velocity becomes restitution times the closing speed, or 0 if it
+    comes to rest. A resting contact is held: it must not close, except by as much as its gap is open.
     """
     push, drives = phase == PUSH, flags(driven(world), dt[None])
     u, closing_acc = (-jax.vmap(dot)(strikes.normal, motion) for motion in (strikes.v_rel, strikes.pull))
@@ -256,7 +255,7 @@ def _held(
 
 
 def _fallen(world: Any, flight: Flight, strikes: Strikes, closing_acc: Array, dt: Array) -> Array:
-    """Speed (C, *batch) [m/s] to which what rested has closed at most after a step of free fall of both bodies."""
+    """Largest closing speed (C, *batch) [m/s] that a resting contact reaches in a step of free fall of both bodies."""
     fall = dt[None] * jnp.sqrt((flight.a**2).sum(1))
     of_both = jnp.maximum(at_colliders(fall, strikes.a, 0.0), at_colliders(fall, strikes.b, 0.0))
     return world.contact.rest_speed[None] + 2.0 * jnp.maximum(of_both, closing_acc * dt[None])

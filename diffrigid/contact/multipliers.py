@@ -1,7 +1,7 @@
-"""The impulses of contacts that share bodies to a few digits, from anywhere: the method of multipliers.
+"""Impulses of contacts that share bodies, to a few digits and from any start: the method of multipliers.
 
-With velocities in which a slip opens the contact too, y + mu |y_t| n, Coulomb's law is that between a cone and its
-dual: P lies in the cone of friction, y + mu |y_t| n - target n in its dual, and the two are orthogonal. With
+With modified velocities in which a slip opens the contact too, y + mu |y_t| n, Coulomb's law is that between a cone
+and its dual: P lies in the cone of friction, y + mu |y_t| n - target n in its dual, and the two are orthogonal. With
 `nearest` the projection onto the cone and any sigma > 0 that is
 
     P = nearest(z),   z = P - sigma (y + mu |y_t| n - target n),   y = v_rel + J u,   u = G J^T P
@@ -28,16 +28,16 @@ from diffrigid.numerics import norm
 from diffrigid.state import rotations
 
 ROUNDS = 40  # at most
-SOFTNESS = 1e-2  # [-] 1 / (sigma k): about what a round leaves of the error in P
-READY = 1e-2  # [-] of u: an error of the inner problem at which the multipliers are taken anew
-HALVINGS = 10  # of a step along its line
+SOFTNESS = 1e-2  # [-] 1 / (sigma k): about the fraction of the error in P that a round leaves
+READY = 1e-2  # [-] of u: error of the inner problem below which the multipliers are updated
+HALVINGS = 10  # bisections of the line search
 
 
 def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error: Callable, enough: Array) -> Array:
     """Impulses of the C contacts, (C, D, *batch) [N s].
 
     Args:
-        error: of impulses, (*batch): that of the best is returned.
+        error: function of impulses, (*batch); the impulses with the least error are returned.
         enough: (*batch) error at which to stop.
     """
     sigma = (1.0 / (SOFTNESS * cone.scale))[:, None]
@@ -80,7 +80,7 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
 
 
 def _down(slope: Callable, whole: Array) -> Array:
-    """The share of a step, at most the whole, from which on a convex function would rise."""
+    """Line search: largest share of a step, at most `whole`, before the slope turns positive (bisection)."""
 
     def halved(_, ends):
         low, high = ends
@@ -96,7 +96,7 @@ def _down(slope: Callable, whole: Array) -> Array:
 
 
 def _momenta(u: Array, mobility: Mobility, D: int) -> Array:
-    """M u of twists (R, *batch)."""
+    """Momenta M u for the stacked twists u (R, *batch)."""
     so, by_body = rotations(D), u.reshape(-1, D + rotations(D).A, *u.shape[1:])
     inertia = jax.vmap(so.inverse_inertia)(mobility.inverse_inertia)
     angular = jax.vmap(so.apply)(inertia, by_body[:, D:])
@@ -104,5 +104,5 @@ def _momenta(u: Array, mobility: Mobility, D: int) -> Array:
 
 
 def _size(u: Array, mobility: Mobility, D: int) -> Array:
-    """Root of u M u, (*batch)."""
+    """Norm sqrt(u . M u) of the stacked twists u, (*batch)."""
     return jnp.sqrt(jnp.maximum((u * _momenta(u, mobility, D)).sum(0), 0.0))

@@ -1,8 +1,8 @@
-"""The closest approach of two paths, from a time on: it sets the level of a smooth impact.
+"""The closest approach of two paths after a given time, which sets the level of a smooth impact.
 
-Forward by steps that grow until the least gap opens, or back over the step if it opens already; then false position for
-the root of its rate, in the form that halves the rate it keeps (Dowell and Jarratt 1971). Two convex bodies that do not
-turn have one closest approach, however far ahead; of those that turn it is the next one.
+The search goes forward by growing steps until the least gap opens, or back to the start if it opens already; then
+false position finds the root of its rate, in the form that halves the retained rate (Dowell and Jarratt 1971). Two
+convex bodies that do not turn have one closest approach, however far ahead; for bodies that turn it is the next one.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,14 @@ from diffrigid.contact.approach import Task, angular_speed
 from diffrigid.contact.gaps import Gaps, deepest
 from diffrigid.numerics import safe_divide, safe_sqrt, softplus
 
-LOOKS = 48  # at most
+LOOKS = 48  # evaluations of the gaps, at most
 FIRST = 0.25  # [-] of the step: the first step forward
-TURN = 0.5  # [rad] of the two against each other, in one step forward at most
-DEEP = 40.0  # [-] of the width: a hit so deep is exact to rounding
+TURN = 0.5  # [rad] largest relative rotation of the two in one step forward
+DEEP = 40.0  # [-] of the width: a deeper hit is exact to rounding
 
 
 class Look(NamedTuple):
-    """At the least gap of a pair."""
+    """An evaluation of a pair's gaps: the least of them, and its rate."""
 
     t: Array  # (*batch) [s]
     gap: Array  # (*batch) [m]
@@ -31,7 +31,7 @@ class Look(NamedTuple):
 
 
 class Closest(NamedTuple):
-    """Between which times two paths come closest."""
+    """Times that bracket the closest approach of two paths."""
 
     before: Array  # (*batch) [s]
     after: Array  # (*batch) [s]
@@ -39,7 +39,7 @@ class Closest(NamedTuple):
 
 
 class Nearing(NamedTuple):
-    """How far the search has come."""
+    """State of the search for the closest approach."""
 
     t: Array  # (*batch) [s] of the next look
     looks: Array  # (*batch) int
@@ -47,13 +47,13 @@ class Nearing(NamedTuple):
     closing: Look  # the latest at which it closes; time -inf: none yet
     opening: Look  # the earliest at which it opens; time inf: none yet
     closed: Array  # (*batch) bool: it closed at the last look
-    kept: Array  # (*batch) what false position makes of the rate that it keeps
-    later: Array  # (*batch) [m] below this gap it comes to its level after the end of the step
+    kept: Array  # (*batch) [-] factor of false position on the retained rate
+    later: Array  # (*batch) [m] with a gap below this, its level is reached after the end of the step
     done: Array  # (*batch) bool
     turns_back: Array  # (*batch) bool: there is a closest approach, between the two
 
     def closest(self) -> Closest:
-        """Without what only the search needs; its times are finite in any case."""
+        """The bracket alone; its times are always finite."""
         before, after = (jnp.where(self.turns_back, look.t, self.t) for look in (self.closing, self.opening))
         return Closest(before, after, self.turns_back)
 
@@ -63,16 +63,16 @@ class Nearing(NamedTuple):
         return jnp.where(self.turns_back, level_at(self.closing, self.opening, width), 0.0)
 
     def comes_to(self, level: Array) -> Array:
-        """About when the gap comes to its level [m], on the way in, (*batch) [s]; inf: there is no closest approach."""
+        """Approximate time (*batch) [s] at which the closing gap is `level` [m]; inf: there is no closest approach."""
         low, high = self.closing, self.opening
         above = safe_divide(2.0 * jnp.maximum(level - low.gap, 0.0) * (high.t - low.t), high.rate - low.rate)
         return jnp.where(self.turns_back, low.t - safe_sqrt(above), jnp.inf)
 
 
 def level_at(closing: Look, opening: Look, width: Array) -> Array:
-    """Level of a smooth impact, (*batch) [m]: at the closest approach, just before and after, for a width (*batch) [m].
+    """Level of a smooth impact of `width` (*batch) [m], (*batch) [m], from looks just before and after the closest gap.
 
-    There the two tangents of the gap meet, which it may do in a kink, where another face becomes the nearest.
+    The closest gap is where the two tangents meet: it may have a kink there, where another face becomes the nearest.
     """
     low, high, span = lax.stop_gradient((closing.rate, opening.rate, opening.t - closing.t))
     share = safe_divide(high, high - low)  # so weighted, it does not depend on the time
@@ -86,14 +86,14 @@ def look_at(t: Array, gaps: Gaps) -> Look:
 
 
 def from_time(t: Array) -> Nearing:
-    """Before the first look, which is at t (*batch) [s]."""
+    """State of a search before its first look, which is at t (*batch) [s]."""
     zero, no = jnp.zeros_like(t), t < t
     never, looks = zero + jnp.inf, jnp.zeros(t.shape, np.int32)
     return Nearing(t, looks, zero, Look(-never, zero, zero), Look(never, zero, zero), no, zero + 1.0, -never, no, no)
 
 
 def nearer(task: Task, now: Nearing, gaps: Gaps) -> Nearing:
-    """After the look at `now.t`."""
+    """State of the search after the look at `now.t`."""
     assert task.width is not None
     here, first = look_at(now.t, gaps), now.looks == 0
     closes, within = here.rate < 0, task.slack * task.span
@@ -109,7 +109,7 @@ def nearer(task: Task, now: Nearing, gaps: Gaps) -> Nearing:
         step = jnp.where(rate > 0, jnp.minimum(step, most / jnp.maximum(rate, task.slack)), step)
     root = jnp.clip(_root(closing, opening, closes, kept), closing.t + within, opening.t - within)
     following = jnp.where(between, root, jnp.where(closes, now.t + step, task.start))
-    # What was not met by the end of the step, and comes nearer by more than a width, comes to its level later.
+    # Without an impact by the end of the step, a gap that shrinks by more than a width reaches its level later.
     later = jnp.where(first, jnp.where(now.t < task.t1, -jnp.inf, here.gap - task.width), now.later)
     deep = (jnp.maximum(here.gap, 0.0) < later) | (here.gap < -DEEP * task.width)
     opens = ~between & ~closes & (now.t <= task.start)
@@ -122,15 +122,15 @@ def nearer(task: Task, now: Nearing, gaps: Gaps) -> Nearing:
 
 
 def _ahead(gap: Array, width: Array) -> Array:
-    """How much the gap may fall until the next look, (*batch) [m]: to zero, and from there on little by little.
+    """Decrease of the gap allowed until the next look, (*batch) [m]: to zero, and beyond that in small steps.
 
-    Inside the nearest corners and faces change, and the first of several least gaps is to be found.
+    In penetration the nearest corners and faces change, and the first of several minima is to be found.
     """
     return jnp.maximum(gap, 0.0) + jnp.maximum(0.5 * width, 0.25 * jnp.abs(gap))
 
 
 def _root(closing: Look, opening: Look, closes: Array, kept: Array) -> Array:
-    """Where the rate is zero on a line between the two, (*batch) [s]; that of the end not looked at now counts less."""
+    """Root of the rate on the line between the two, (*batch) [s]; the rate at the older end is weighted by `kept`."""
     low = closing.rate * jnp.where(closes, 1.0, kept)
     high = opening.rate * jnp.where(closes, kept, 1.0)
     share = safe_divide(low, low - high)

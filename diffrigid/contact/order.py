@@ -16,52 +16,52 @@ from diffrigid.contact.sides import at_colliders, body_sides
 from diffrigid.gathers import rows
 from diffrigid.pytree import array, pytree, replace
 
-# Power of the spacing of numbers, of a step: what is held no longer than this need not be. Else a gap of rounding, or
-# in double precision the error of the second time to which it is held, would take a sweep.
+# Times no longer than eps ** SOON of a step need not be held. Else a gap of rounding, or in double precision the error
+# of the second time until which a contact is held, would take a sweep.
 SOON = 0.25
 
 
 @pytree
 class Meeting:
-    """When two colliders meet, or the two bodies of a joint come to its limit; many with a leading axis."""
+    """When two colliders meet, or a joint reaches its limit; many with a leading axis."""
 
     s: Array = array()  # [s] of the impact, if there is one before the end of the step; else its end
-    hit: Array = array()  # bool: there is, or contacts are those of the end
+    hit: Array = array()  # bool: there is one, or the contacts are those at the end
     fast: Array = array()  # bool: an impact that is not slow
     rests: Array = array("K")  # bool, of each contact: it touches from the start of the path on
-    level: Any = array(default=None)  # [m] of the gap at which they meet
+    level: Any = array(default=None)  # [m] gap at which they meet
     slack: Any = array(default=None)  # [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size
     now: Any = array(default=None)  # bool: this impact is handled in this pass
-    joins: Any = array(default=None)  # bool: what rests here takes part in an impact of this pass
-    held: Any = array(default=None)  # bool: s is the time until which what rests is held
+    joins: Any = array(default=None)  # bool: the resting contacts take part in an impact of this pass
+    held: Any = array(default=None)  # bool: s is the time until which the resting contacts are held
 
 
 class Links(NamedTuple):
-    """What may act on what: M links between two colliders, and the joints of N bodies."""
+    """Which bodies may act on each other: M links between two colliders, and N bodies connected by joints."""
 
     a: tuple[int, ...]  # colliders of each link: bodies, then statics
     b: tuple[int, ...]
-    islands: tuple[tuple[int, ...], ...]  # for each body, those that hang together with it by joints, itself included
+    islands: tuple[tuple[int, ...], ...]  # for each body, those connected with it by joints, itself included
 
     def of_bodies(self, reduce: Callable, values: Array, none: Any) -> Array:
-        """Values (M, *batch) of the links reduced for each body, (N, *batch); `none` if it has no links."""
+        """Reduce values (M, *batch) over the links of each body's island, (N, *batch); `none` if it has no links."""
         padded = jnp.concatenate([values, values, jnp.full_like(values[:1], none)])
         sides = body_sides(self.a, self.b, len(self.islands))
         return over_islands(reduce, reduce(rows(padded, sides), axis=1), self.islands, none)
 
     def least(self, of_bodies: Array, still: Any) -> Array:
-        """Of the values (N, *batch) of the two bodies of each link, (M, *batch); `still` is that of a static."""
+        """Smaller value (N, *batch) of the two bodies of each link, (M, *batch); `still` stands in for a static."""
         return jnp.minimum(at_colliders(of_bodies, self.a, still), at_colliders(of_bodies, self.b, still))
 
 
 def in_order(
     meetings: list[Meeting], links: Links, t0: Array, dt: Array, at_end: Array, bounces: Array | None
 ) -> list[Meeting]:
-    """Whose turn it is: the meetings with `now` and `held`.
+    """Set `now`, `joins` and `held` of the meetings: whose turn it is in this pass.
 
     Args:
         meetings: of the links, M in all.
-        links: an impact reaches all bodies that hang together by joints.
+        links: an impact reaches all bodies that are connected by joints.
         t0: (N, *batch) [s] where their paths begin.
         at_end: bool; True: all are at the end of the step.
         bounces: (M, *batch) bool: there is restitution between them. None: no bodies have to be held until an impact.
@@ -75,7 +75,7 @@ def in_order(
         return links.of_bodies(jnp.min, jnp.where(impacts, s, jnp.inf), jnp.inf)
 
     first = first_of(fast)
-    # What closes slowly at the time of an impact, as by rounding, takes no part: touching balls pass it on.
+    # Contacts that close slowly at the time of an impact, as by rounding, take no part: touching balls pass it on.
     now = fast & (jnp.abs(lax.stop_gradient(s - links.least(first, jnp.inf))) <= tie)
     held = jnp.broadcast_to(at_end, s.shape)
     joins = jnp.zeros_like(now)
@@ -104,10 +104,10 @@ def in_order(
 
 
 def hanging_together(on: Array, links: Links) -> Array:
-    """For each of N bodies the least of those that it hangs together with, (N, *batch) int.
+    """Connected component of each of N bodies, (N, *batch) int: the smallest index of the bodies in it.
 
     Args:
-        on: (M, *batch) bool: the two of a link do. Statics hold nothing together.
+        on: (M, *batch) bool: the link connects its two bodies. Statics connect nothing.
     """
     moving = len(links.islands)
     number = lax.broadcasted_iota(jnp.int32, (moving, *on.shape[1:]), 0)
@@ -142,7 +142,7 @@ def _of_clusters(
 
 
 def over_islands(reduce: Callable, values: Array, islands: tuple, none: Any) -> Array:
-    """Values of the bodies (N, ...) reduced over those that hang together with each, (N, ...)."""
+    """Reduce values of the bodies (N, ...) over the island of each, (N, ...)."""
     most = max(map(len, islands))
     if most == 1:
         return values

@@ -1,4 +1,4 @@
-"""Many contacts at once: those that share a body at the same time, in an impact or at rest."""
+"""Impulses of many contacts at once, some of which share a body, in an impact or at rest."""
 
 from typing import Any, NamedTuple
 
@@ -20,40 +20,40 @@ from diffrigid.pytree import array, pytree, static
 class Strikes:
     """C contacts of all kinds in one list, each at its own time."""
 
-    active: Array = array("C")  # (C, *batch) bool: touching at s; once its pass is known: takes part in it
+    active: Array = array("C")  # (C, *batch) bool: touching at s; later, whether it takes part in the pass
     s: Array = array("C")  # (C, *batch) [s]
     gap: Array = array("C")  # [m]
-    rounding: Array = array("C")  # [m] up to which a gap may be open by it
-    deepest: Array = array("C")  # [m] that one step pushes apart what is inside each other
+    rounding: Array = array("C")  # [m] gap that may be due to rounding
+    deepest: Array = array("C")  # [m] largest penetration that one step resolves
     normal: Array = array("C", "D")  # from b to a
     arm_a: Array = array("C", "D")  # [m] contact point from the centre of mass of a, world axes
     arm_b: Array = array("C", "D")
-    mid_a: Any = array("C", "D", default=None)  # [m] where impulses act, half of the time before s; None: at the arm
+    mid_a: Any = array("C", "D", default=None)  # [m] arm of impulses, half the held time before s; None: arm_a
     mid_b: Any = array("C", "D", default=None)
-    turn: Any = array("C", "A", default=None)  # [rad] from the impulse at s to what acts there; None: none
+    turn: Any = array("C", "A", default=None)  # [rad] rotation of the impulse at s to where it acts; None: none
     K: Array = array("C", "D", "D")  # [1/kg] effective matrix
-    # [m/s] of a against b at the contact point, before the impulse; where gaps are closed (PUSH) these along the
-    # normal, [m], so that an impulse is [kg m] and what it changes places.
+    # [m/s] of a against b at the contact point, before the impulse; where gaps are closed (PUSH) the gap along the
+    # normal, [m], so that an impulse is [kg m] and changes positions.
     v_rel: Array = array("C", "D")
     pull: Array = array("C", "D")  # [m/s^2] acceleration of a against b there
     rests: Array = array("C")  # bool: it touches from the start of the path on
     now: Array = array("C")  # bool: it is the turn of this impact
     held: Array = array("C")  # bool: s is the time until which it is held, not that of an impact
-    drift: Array = array("C", "D")  # [m/s] half the velocity of a against b, of the centres; 0 at a static
+    drift: Array = array("C", "D")  # [m/s] half the velocity of centre a relative to centre b; 0 at a static
     a: tuple[int, ...] = static(default=())  # collider of each contact: bodies, then statics
     b: tuple[int, ...] = static(default=())
-    wholes: tuple = static(default=())  # a label of each contact and row: those with the same slip as one
-    jac: Any = array("R", "2", "D + A", default=None)  # of the last R, which are rows of joints; see `Arms`
+    wholes: tuple = static(default=())  # label of each contact and row: those with the same label slip as one
+    jac: Any = array("R", "2", "D + A", default=None)  # of the last R, the rows of joints; see `Arms`
     mid_jac: Any = array("R", "2", "D + A", default=None)
-    spin: Any = array("K", default=None)  # [m] of K rows behind the first K contacts, against turning; see `Cone`
+    spin: Any = array("K", default=None)  # [m] of the K rolling rows, behind the first K contacts; see `Cone`
 
 
 class Law(NamedTuple):
-    """What contacts and rows demand, each (C, *batch)."""
+    """Contact law of contacts and rows, each (C, *batch)."""
 
     target: Array  # [m/s] normal velocity after the impulse
     mu: Array  # [-]
-    most: Array | None  # [N s] of the normal impulse, to both sides; infinite: it pushes, without bound. None: all do
+    most: Array | None  # [N s] bound of a two-sided normal impulse; infinite: it only pushes, unbounded. None: all so
 
 
 def solve_impulses(
@@ -61,13 +61,13 @@ def solve_impulses(
 ) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
-    A contact that is alone on its bodies, which have no joints, has its own law, `contact_law`. Others are solved
-    together, `together.py`. What a world never has is not even compiled, as the latter for one disc over a floor.
+    A contact that is alone on its bodies, if these have no joints, follows `contact_law`. Others are solved together
+    (`together.py`). What a world never needs is not even compiled, as the latter for one disc over a floor.
 
     Args:
         count: (N, *batch) number of active contacts of each body.
-        rest_speed: (*batch) [m/s] what is slow in these worlds.
-        guess: (C, D, *batch) [N s] impulses that a solution of many may be near to.
+        rest_speed: (*batch) [m/s] speed that is slow in these worlds.
+        guess: (C, D, *batch) [N s] impulses to begin with; of many solutions the one near to it is taken.
     """
     target, mu, most = law
     if not mobility.joined and are_alone(strikes.a, strikes.b, len(count)):
@@ -94,21 +94,22 @@ def solve_impulses(
 
 
 def barely(strikes: Strikes, rest_speed: Array) -> Array:
-    """Impulses of contacts that hardly push, (C, D, *batch) [N s]: to change their velocities by `rest_speed`.
+    """Small impulses (C, D, *batch) [N s], which change the velocities of active contacts by about `rest_speed`.
 
-    Newton's method takes what pushes to stick. From nothing it would find out that a pile does floor by floor.
+    As a start for Newton's method, which takes contacts that push to stick. From zero it would find out layer by layer
+    that a pile does.
     """
     on = strikes.active.astype(strikes.s.dtype)
     return (on * safe_divide(rest_speed[None], _scale(strikes)))[:, None] * strikes.normal
 
 
 def _scale(strikes: Strikes) -> Array:
-    """Size of the effective matrices, (C, *batch) [1/kg]."""
+    """Frobenius norm of the effective matrices, (C, *batch) [1/kg]."""
     return safe_sqrt((strikes.K**2).sum((1, 2)))
 
 
 def are_alone(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> bool:
-    """Whether no body is in more than one contact, of those between colliders a and b. Static."""
+    """Whether no body is in more than one of the contacts between colliders a and b. Static."""
     bodies = [i for i in a + b if i < moving]
     return len(set(bodies)) == len(bodies)
 

@@ -1,4 +1,4 @@
-"""Friction against rolling and spinning: a row beside each contact, along which its two bodies turn.
+"""Friction against rolling and spinning: one row ("rolling row") per contact, for its two bodies' relative rotation.
 
 The torque on body a at a contact with the normal force N is at most rolling_friction N across the normal and, in
 space, spinning_friction N about it, and it stops the turning w_a - w_b if it can; likewise impulses in an impact. Rows
@@ -29,12 +29,12 @@ from diffrigid.state import rotations
 def with_rows(
     world: Any, strikes: Strikes, law: Law, T: Array, flight: Flight, t: Array, mobility: Mobility, kick: Array
 ) -> tuple[Strikes, Law, Array]:
-    """Strikes, law and times T of `solve_impulses` with the rows.
+    """Add the rolling rows to the strikes, law and times T of `solve_impulses`.
 
     Args:
         T: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
         t: (N, *batch) [s] of each body, at which `mobility` is.
-        kick: 0 where gaps are pushed open, which turns nothing; else 1.
+        kick: 0 where gaps are closed (PUSH), which turns nothing; else 1.
     """
     so, count, batch, flat = rotations(world.dim), contact_count(world), t.shape[1:], world.dim == 2
     zero = jnp.zeros((count, *batch), t.dtype)
@@ -42,7 +42,7 @@ def with_rows(
     roll, spin = (zero, roll) if flat else (roll, spin)
     a, b, own = strikes.a[:count], strikes.b[:count], strikes.wholes[:count]
 
-    def turns(values: Array) -> Array:  # of the bodies, (N, A, *batch), to a against b as vectors
+    def turns(values: Array) -> Array:  # values of the bodies, (N, A, *batch), to those of a minus b as vectors
         change = at_colliders(values, a, 0.0) - at_colliders(values, b, 0.0)
         return jnp.pad(change, [(0, 0), (0, so.D - so.A), *[(0, 0)] * len(batch)])
 
@@ -70,7 +70,7 @@ def with_rows(
 
 
 def _of_contacts(world: Any, name: str, zero: Array) -> Array:
-    """A coefficient of all contacts, zero if the world does not have it."""
+    """Coefficient `name` of all contacts, zero if the world does not have it."""
     if getattr(world.bodies, name) is None:
         return zero
     return coefficients(world, name, zero.shape[1:])
@@ -81,7 +81,7 @@ def _behind(count: int, values: Array, rows: Array) -> Array:
 
 
 def _mobility_of_turns(mobility: Mobility, a: tuple[int, ...], b: tuple[int, ...], so: Any) -> Array:
-    """Change of w_a - w_b for torque impulses, (K, D, D, *batch) [1/(kg m^2)]."""
+    """Change of w_a - w_b per torque impulse, (K, D, D, *batch) [1/(kg m^2)]."""
     inverse = at_colliders(mobility.inverse_inertia, a, 0.0) + at_colliders(mobility.inverse_inertia, b, 0.0)
     if so.D == 3:
         return inverse
@@ -89,10 +89,10 @@ def _mobility_of_turns(mobility: Mobility, a: tuple[int, ...], b: tuple[int, ...
 
 
 def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
-    """`stopping_early`, and the same for rolling and spinning that stop, (C, D, *batch) [N s^2].
+    """`stopping_early`, extended to rolling and spinning that stop early, (C, D, *batch) [N s^2].
 
-    Where a contact sticks, the torque of its row brings an impulse with it that keeps the contact from slipping. Both
-    have the same centroid in time. Exact for one contact of two bodies.
+    Where a contact sticks, the torque of its row comes with an impulse that keeps the contact from slipping. Both have
+    the same centroid in time. Exact for one contact of two bodies.
     """
     spin, mu, torque = strikes.spin, law.mu, turning(strikes.spin, P)
     sticks = _sticks(strikes, P, mu)
@@ -110,7 +110,7 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: A
 
 
 def rows_of(strikes: Strikes) -> Strikes:
-    """The rows that turn."""
+    """The rolling rows alone."""
     spin, count = strikes.spin, len(strikes.spin)
     plain = replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None, spin=None)
     a, b, wholes = (of_all[:count] for of_all in (strikes.a, strikes.b, strikes.wholes))
@@ -126,13 +126,13 @@ def _across(n: Array, r: Array) -> Array:
 
 
 def _sticks(strikes: Strikes, P: Array, mu: Array) -> Array:
-    """1 for contacts that do not slip, (K, *batch)."""
+    """1 for contacts that stick, else 0; (K, *batch)."""
     P_n, P_t = (part[: len(strikes.spin)] for part in split(strikes.normal, P))
     return (jax.vmap(norm)(P_t) < STICKS * mu[: len(P_n)] * P_n).astype(P.dtype)
 
 
 def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: Array) -> Array:
-    """Torques of the rows (K, D, *batch), and what keeps their contacts from slipping, (C, D, *batch) [N s]."""
+    """Torques of the rows (K, D, *batch), with impulses that prevent slip at their contacts, (C, D, *batch) [N s]."""
     so, count = rotations(torque.shape[1]), len(torque)
 
     def dragged(side: tuple[int, ...], arm: Array) -> Array:  # velocity of the contact point by the torque
@@ -146,7 +146,7 @@ def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: 
 
 
 def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
-    """`stopping_early` of contacts and rows of joints; to them the torques are a pull that acts evenly."""
+    """`stopping_early` of contacts and rows of joints, with the torques of the rolling rows as an even pull."""
     spin, count = strikes.spin, len(strikes.spin)
     by_torque = moved(put(spin, jnp.zeros_like(P), turning(spin, P)), strikes, mobility)
     pull = strikes.pull + by_torque / jnp.where(T > 0, T, 1.0)[:, None]

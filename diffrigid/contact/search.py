@@ -1,14 +1,14 @@
-"""When any two shapes meet: conservative advancement towards the first contact, then the parabola of its gap.
+"""Time at which any two shapes meet: conservative advancement to the first contact, then the parabola of its gap.
 
-Searched without derivatives; `impact.py` gives the time that is found that of the implicit function theorem. A pair of
-a world goes through three stages, each some looks at its gaps:
+The search has no derivatives; `impact.py` gives the time it finds that of the implicit function theorem. A pair of a
+world goes through three stages, each with several evaluations ("looks") of its gaps:
 
-    ADVANCING    by what no contact can close earlier, until one is near and closing, or the step is over
+    ADVANCING    by times within which no contact can close, until one is near and closing, or the step is over
     NEARING      towards the closest approach of the two paths, which sets the level of a smooth impact
-    POLISHING    along the parabola of the gap, to where it is at its level
+    POLISHING    along the parabola of the gap, to the time at which it is at its level
 
-Above a half-space, where a look is cheap, each stage is a loop. Else the gaps are most of the program, and all stages
-are one loop, so that the gaps are compiled once; every world is in a stage of its own.
+Above a half-space, where a look is cheap, each stage is a loop. Otherwise the gaps are most of the program, and all
+stages share one loop, so that the gaps are compiled once; every world is in a stage of its own.
 """
 
 from collections.abc import Callable
@@ -37,9 +37,9 @@ ADVANCING, NEARING, POLISHING, DONE = range(4)
 def approach_search(
     a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array, at_end: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Any two shapes: time of the next impact, level of the gap then, whether there is one, which contacts rest.
+    """Search the next impact of any two shapes: its time, level of the gap, whether there is one, which contacts rest.
 
-    Nothing is looked for `at_end`, a bool. Only the level has a gradient.
+    With `at_end`, a bool, nothing is searched. Only the level has a gradient.
     """
     task, live = task_of(a, b, t1, width, rest_speed), opaque_true(t1)
     search = _stage_by_stage if isinstance(b.shape, HalfSpace) else _in_one_loop
@@ -59,7 +59,7 @@ def approach_search(
 
 
 class Found(NamedTuple):
-    """What a search ends with."""
+    """Result of a search."""
 
     s: Array  # (*batch) [s] where they meet, if `found`
     near: Array  # (*batch) [s] where the polishing began
@@ -124,7 +124,7 @@ def _count(task: Task, start: Array, live: Array) -> int:
 
 
 class Search(NamedTuple):
-    """How far it has come."""
+    """State of a search in one loop."""
 
     count: Any  # int: looks
     stage: Array  # (*batch) int
@@ -158,7 +158,7 @@ def _in_one_loop(task: Task, start: Array, at_end: Array, live: Array) -> Found:
 
 
 def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
-    """What follows from the gaps at one time; a search is in a later stage as soon as it comes to it."""
+    """Make the update of a search by the gaps at one time; it may go through several stages in one update."""
     clear = clearance(task)
 
     def follow(now: Search, gaps: Gaps) -> Search:
@@ -179,7 +179,7 @@ def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
 
 
 def _advanced(task: Task, now: Search, dt: Array) -> Search:
-    """After an advance by dt; where there is none, or no more, the next stage begins."""
+    """Search after an advance by dt; the next stage begins where dt <= 0, at the end, and after too many advances."""
     # Across a grid an advance ends after half a cell, or in contact.
     grid = task.b.shape.heights.shape[:2] if isinstance(task.b.shape, HeightField) else ()
     arrived = (dt <= 0) | (now.s >= task.t1) | (now.count >= ADVANCES + CROSSED * sum(grid))
@@ -189,7 +189,7 @@ def _advanced(task: Task, now: Search, dt: Array) -> Search:
 
 
 def _polished(task: Task, now: Search, gaps: Gaps) -> Search:
-    """After a step to where the first contact that does not rest comes to its level, if one does."""
+    """Search after a step to where the first contact that does not rest reaches its level, if one does."""
     look = polish(task, gaps, now.rests, now.level, now.s)
     done = look.converged(task) | (now.tries >= POLISH)
     return now._replace(
@@ -199,7 +199,7 @@ def _polished(task: Task, now: Search, gaps: Gaps) -> Search:
 
 
 def _nearer(task: Task, now: Search, gaps: Gaps) -> Search:
-    """After a look for the closest approach; where it is found the next stage begins."""
+    """Search after a look for the closest approach; where it is found the next stage begins."""
     assert now.nearing is not None
     seen = choose(now.tries == 0, from_time(now.near), now.nearing)
     seen = nearer(task, seen, gaps)
@@ -211,5 +211,5 @@ def _nearer(task: Task, now: Search, gaps: Gaps) -> Search:
 
 
 def _polished_from(task: Task, near: Array, seen: Nearing) -> Array:
-    """(*batch) [s] the end of the advances, which may lie behind the closest approach, or before it."""
+    """Time (*batch) [s] from which to polish: the end of the advances, or where the level is reached before it."""
     return jnp.maximum(jnp.minimum(near, seen.comes_to(seen.level(task.width))), task.start)

@@ -55,7 +55,7 @@ def sides_of(world: Any, pairs: PairGroup, flight: Flight, since: Array) -> tupl
 
 
 def side_of(world: Any, flight: Flight, since: Array, kind: int, shape_rows: tuple, colliders: tuple) -> Side:
-    """Shapes `shape_rows` of world.shapes[kind], on colliders that all move or all stand still."""
+    """Side with shapes `shape_rows` of world.shapes[kind], on colliders that all move or are all static."""
     moving = flight.t0.shape[0]
 
     def chosen(tree, index):
@@ -95,7 +95,7 @@ def centre(side: Side, s: Array) -> tuple[Array, Array]:
 
 
 def earliest(a: Side, b: Side) -> tuple[Array, Array]:
-    """Time from which both paths hold, and how far back a late impact may be repaired."""
+    """Time from which both paths hold, and the earliest time at which a late impact may be repaired; (*batch) [s]."""
     start = began(a, b)
     if b.flight is None or a.flight is None:
         return start, (a if b.flight is None else b).since
@@ -103,7 +103,7 @@ def earliest(a: Side, b: Side) -> tuple[Array, Array]:
 
 
 def began(a: Side, b: Side) -> Array:
-    """Time from which both paths hold, (*batch) [s]."""
+    """Time from which both paths hold, (*batch) [s]: the later of their beginnings."""
     if b.flight is None or a.flight is None:
         return (a if b.flight is None else b).flight.t0
     return jnp.maximum(a.flight.t0, b.flight.t0)
@@ -115,7 +115,7 @@ def contacts_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
 
 
 def candidates_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
-    """What a search for an impact must know: more than the contacts if these are chosen from many."""
+    """Contacts that a search for an impact must examine: all candidates, where the contacts are a selection of them."""
     if isinstance(b.shape, HeightField):
         return candidates(a.shape, *_origin(a, at_a), b.shape, *_origin(b, at_b))
     return contacts_of(a, at_a, b, at_b)
@@ -136,7 +136,7 @@ def relative_velocity(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) ->
 def relative_acceleration(at_a: Placed, at_b: Placed, point_a: Array, point_b: Array) -> Array:
     """Acceleration of a at a world point against b at another, a + dw x r + w x (w x r) of each, (D, *batch) [m/s^2].
 
-    It steers the search for an impact, no more, and so need not be exact.
+    It only guides the search for an impact, and so need not be exact.
     """
 
     def one(at, arm):
@@ -165,7 +165,8 @@ def gap_rates(contacts: Contacts, at_a: Placed, at_b: Placed) -> Array:
 def moving_along(side: Side, at: Placed, s: Array) -> Placed:
     """The collider at time s (*batch) [s] with the rates of its path.
 
-    Where forces vary these are not quite its velocities: both are curves that end where the integration does.
+    With varying forces these differ slightly from its velocities: position and velocity are then separate curves, both
+    of which end where the integration does.
     """
     f = side.flight
     if f is None or f.jerk is None:
@@ -180,12 +181,12 @@ def moving_along(side: Side, at: Placed, s: Array) -> Placed:
 
 
 def core_reach_of(side: Side) -> Array:
-    """Radius about the centre of mass that holds the core: what lies about it at one distance does not feel a spin."""
+    """Radius about the centre of mass that encloses the core; the rounding around the core does not feel a spin."""
     return reach_of(side) - lax.stop_gradient(radius(side.shape))
 
 
 def reach_of(side: Side) -> Array:
-    """Radius about the centre of mass that holds the shape, (*batch) [m]; huge for what is boundless."""
+    """Radius about the centre of mass that encloses the shape, (*batch) [m]; huge for unbounded shapes."""
     if isinstance(side.shape, BOUNDLESS):
         return jnp.full_like(side.x[0], FAR)
     shape, offset = lax.stop_gradient((side.shape, side.offset))
@@ -200,7 +201,7 @@ def side_sum(values_a: Array, values_b: Array, a: tuple[int, ...], b: tuple[int,
 
 
 def pair_sum(values: Array, a: tuple[int, ...], b: tuple[int, ...]) -> Array:
-    """Sum of per-contact values over the contacts of each pair that are side by side, (P, ...); see `pairs_of`."""
+    """Sum of per-contact values over each run of contacts between the same two, (P, ...); see `pairs_of`."""
     parts, start = [], 0
     for length, pairs in itertools.groupby(_runs(a, b)):
         count = len(list(pairs))

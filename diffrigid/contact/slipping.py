@@ -1,4 +1,4 @@
-"""Where resting contacts and friction displace bodies within a step, apart from what their even force does."""
+"""Displacements by resting contacts and friction within a step, beyond those of a force that acts evenly."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,14 +15,14 @@ from diffrigid.gathers import constant, sum_rows
 from diffrigid.numerics import dot, norm, safe_divide
 from diffrigid.pytree import replace
 
-STICKS = 1.0 - 1e-6  # of the bound of friction
-CREEP = 1e-6  # [m/s] of a slip that is none; in single precision the root of rounding is more
+STICKS = 1.0 - 1e-6  # [-] of the bound of friction: below it a contact sticks
+CREEP = 1e-6  # [m/s] slower slip counts as none; in single precision sqrt(eps) is larger
 
 
 def keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array:
-    """Changes of L (N, A, *batch) that go with displacements P / m of two bodies of which one drifts from the other.
+    """Changes of L (N, A, *batch) that balance displacements P / m of two bodies that move relative to each other.
 
-    They move the angular momentum about the origin by P x (v_a - v_b): both bodies give back half of it.
+    The displacements change the angular momentum about the origin by P x (v_a - v_b); each body gives back half of it.
     """
     jac = None if strikes.jac is None else jnp.zeros_like(strikes.jac)
     if strikes.spin is not None:  # torques displace nothing
@@ -38,12 +38,11 @@ def drift_after(strikes: Strikes, dv: Array) -> Array:
 
 
 def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
-    """Displacement that is missing where a slip stops early, as impulse times time: (C, D, *batch) [N s^2].
+    """Displacement missed by spreading friction evenly over T where a slip stops earlier, (C, D, *batch) [N s^2].
 
-    P is taken as spread evenly over T. In fact friction brakes with its full bound until the slip stops at tau, and
-    then only balances the pull. The braking part acts earlier, with its centroid at tau / 2 instead of T / 2, so it
-    moves the contact by a further (T - tau) / 2 of what it changes its velocity. Exact for one direction of slip under
-    a constant pull.
+    In fact friction brakes with its full bound until the slip stops at tau, and then only balances the pull. The
+    braking part acts earlier, with its centroid at tau / 2 instead of T / 2, so it moves the contact further, by
+    (T - tau) / 2 times its change of velocity. Exact for one direction of slip under a constant pull.
     """
     (part, bounds), most = rubbing(strikes, P, law), law.most
     at_end, slip = slips(part, strikes, law.target, T)
@@ -54,9 +53,9 @@ def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: 
 
 
 def rubbing(strikes: Strikes, P: Array, law: Law) -> tuple[Callable, Array]:
-    """The part of a vector at every contact (C, D, *batch) that friction acts along, and its bounds (C, *batch) [N s].
+    """Map to the part of a vector (C, D, *batch) along which friction acts, and its bounds (C, *batch) [N s].
 
-    That of a joint rubs along its coordinate.
+    In rows of joint friction that is the whole vector, which lies along the joint's coordinate.
     """
     n, (_, mu, most) = strikes.normal, law
     bounds = mu * jax.vmap(dot)(n, P)
@@ -77,7 +76,7 @@ def slips(part: Callable, strikes: Strikes, target: Array, T: Array) -> tuple[Ar
 
 
 def most_resisting(mobility: Mobility, strikes: Strikes) -> Array:
-    """What most resists a slip of each contact, (C, *batch) [kg]: the reduced mass, with joints the mass of all."""
+    """Largest mass that can resist a slip of each contact, (C, *batch) [kg]: the reduced mass; with joints, of all."""
     if mobility.matrix is not None:
         return jnp.broadcast_to((1.0 / mobility.inverse_mass).sum(0)[None], strikes.s.shape)
     a, b = (at_colliders(mobility.inverse_mass, side, 0.0) for side in (strikes.a, strikes.b))
@@ -85,28 +84,28 @@ def most_resisting(mobility: Mobility, strikes: Strikes) -> Array:
 
 
 def least_slip(dtype: Any) -> float:
-    """What is slower does not slip [m/s]."""
+    """Speed [m/s] below which a contact does not slip."""
     return max(CREEP, float(jnp.finfo(dtype).eps) ** 0.5)
 
 
 def in_all(strikes: Any, slipping: Array, values: Array) -> Array:
-    """Sums (C, *batch) over the contacts of the same two rigid wholes that are `slipping`, which they do as one."""
+    """Sums (C, *batch) over the `slipping` contacts between the same two rigid clusters, which slip as one."""
     return sum_rows(jnp.where(slipping, values, 0.0), alike(strikes.wholes))
 
 
 def lost_to_stops(
     strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array, most_to_stop: Array
 ) -> Array:
-    """What impulses `friction` (C, D, *batch) within `bounds` (C, *batch) move too little; see `stopping_early`.
+    """Displacement missed by impulses `friction` (C, D, *batch) within `bounds` (C, *batch); see `stopping_early`.
 
     Args:
         slip, at_end: (C, D, *batch) [m/s] at the beginning, and at the end without friction.
-        most_to_stop: (C, *batch) [N s] the friction that can have stopped the slip. All other holds against what does
-            not slip, as that at a corner about which a body turns.
+        most_to_stop: (C, *batch) [N s] largest friction that can have stopped the slip. The rest resists what does not
+            slip, as at a corner about which a body turns.
     """
     speed, at_end_speed = (jax.vmap(norm)(r) for r in (slip, at_end))
     slipping = speed > least_slip(T.dtype)
-    # What acts against the slip of two wholes, by its power, which is one where how contacts share friction is not.
+    # Friction against the slip of two clusters, by its power, which is unique where its division among contacts is not.
     power, bound = (in_all(strikes, slipping, each) for each in (-jax.vmap(dot)(friction, at_end), bounds))
     most_power = in_all(strikes, slipping, bounds * at_end_speed)
     along = jax.vmap(dot)(at_end, slip / jnp.where(speed > 0, speed, 1.0)[:, None])

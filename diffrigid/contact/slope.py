@@ -1,7 +1,7 @@
-"""The derivative of what contacts may do of an impulse, and Newton's step with it, as large as the bodies are many.
+"""The derivative of the projection `allowed`, and a Newton step with it that solves a system of the bodies' size.
 
-D is that of `allowed` at z, e the compliance of contacts; see `together.py`. B = 1 - (1 - e) D has an inverse contact
-by contact, and with u = G J^T dP, the change of the twists of the bodies,
+D is the derivative of `allowed` at z, e the compliance of contacts; see `together.py`. B = 1 - (1 - e) D is inverted
+contact by contact, and with u = G J^T dP, the change of the twists of the bodies,
 
     (B + D W / k) dP = r:    (1 + G J^T B^-1 D J / k) u = G J^T B^-1 r,    dP = B^-1 (r - D J u / k)
 """
@@ -25,13 +25,13 @@ class Slope:
     """D, the derivative of `allowed` at z, contact by contact, as numbers and directions."""
 
     on: Array = array("C")  # 1 where the contact pushes, else 0
-    slides: Array = array("C")  # 1 where it does at its bound of friction
-    bends: Array = array("C")  # [-] how far the direction of sliding follows z; 1 where it sticks
+    slides: Array = array("C")  # 1 where friction is at its bound
+    bends: Array = array("C")  # [-] derivative of friction across the sliding by that of z; 1 where it sticks
     normal: Array = array("C", "D")
     along: Array = array("C", "D")  # of the sliding
     mu: Array = array("C")
-    free: Any = array("K", default=None)  # rows that turn: 1 where along the normal they are within their bounds
-    spin: Any = array("K", default=None)  # [m] else how that follows the load
+    free: Any = array("K", default=None)  # rolling rows: 1 where their normal part is within its bounds
+    spin: Any = array("K", default=None)  # [m] where it is at its bound: its derivative with respect to the load
     e: float = static(default=0.0)  # [-] compliance
 
 
@@ -82,10 +82,10 @@ def _unsloped(slope: Slope, r: Array) -> tuple[Array, Array]:
 
 
 def _unsloped_rows(slope: Slope, x_n: Array, r_along: Array, r_across: Array, rest: Array):
-    """The same where rows turn: what loads them is the first of the results, at their contacts.
+    """`_unsloped` with rolling rows, whose bounds follow the first result, B^-1 r, at their contacts.
 
     Args:
-        x_n: normal components of B^-1 r but for what rows get from their load.
+        x_n: normal components of B^-1 r, without what rows get from their load.
     """
     e, on, count = slope.e, slope.on, len(slope.spin)
     load = put(slope.spin, x_n, (on * x_n)[:count])
@@ -103,11 +103,11 @@ def answer(slope: Slope, cone: Cone) -> Callable[[Array], Array]:
 
 
 def _pushed_back(slope: Slope, cone: Cone, arms: Arms, twist: Array) -> Array:
-    """B^-1 D J / k of the twists (C, *batch) of all bodies: impulses, (C, D, *batch)."""
+    """B^-1 D J / k times the stacked twists (R, *batch) of all bodies: impulses, (C, D, *batch)."""
     return answer(slope, cone)(at_contacts(arms, twist))
 
 
 def newton_step(r: Array, matrix: Array, slope: Slope, cone: Cone, arms: Arms, mobility: Mobility) -> Array:
-    """dP of (B + D W / k) dP = r, (C, D, *batch); the matrix is that of the twists."""
+    """Solve (B + D W / k) dP = r for dP, (C, D, *batch); `matrix` is that of the twists (`bodies_matrix`)."""
     direct = _unsloped(slope, r)[0]
     return direct - _pushed_back(slope, cone, arms, solve_regular(matrix, twists(direct, arms, mobility)))

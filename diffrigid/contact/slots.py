@@ -1,7 +1,7 @@
-"""Slots: the few impacts of a pass in each world, gathered from its bodies, evaluated, and put back.
+"""Slots: the few impacts of a pass in each world, gathered from its bodies, evaluated, and scattered back.
 
-A slot takes its two bodies by a product with zeros and ones, summed over the bodies, which unlike a gather along
-the batch is vectorised, in both directions.
+Bodies are gathered into slots, and scattered back, by products with one-hot weights summed over the bodies: unlike
+indexing along the batch this vectorises, in both directions.
 """
 
 import functools
@@ -27,7 +27,7 @@ from diffrigid.state import rotations
 
 
 class Table(NamedTuple):
-    """The pairs of one kind: all N bodies against each other, or against B statics."""
+    """Pairs of one kind: all N bodies against each other, or against B statics."""
 
     pairs: PairGroup
     rows_a: tuple[int, ...]  # of world.shapes, for each body
@@ -37,7 +37,7 @@ class Table(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """E impacts of each world, or fewer, as weights 0 or 1; at most one in all rows of a slot."""
+    """Up to E impacts of each world, as weights 0 or 1; in each slot at most one row has weight 1."""
 
     a: Array  # (E, N, *batch) body a
     b: tuple[Array, ...]  # for each table (E, N or B, *batch) the other side; all 0 if the slot is not of its kind
@@ -118,17 +118,17 @@ def sides_of_table(world: Any, table: Table, flight: Flight, since: Array) -> tu
 
 
 def _where(chosen: Array, new: Array, old: Array) -> Array:
-    """Choice by the leading axis and the batch: (M, *batch), (M, ..., *batch)."""
+    """Select by leading axis and batch: `chosen` (M, *batch), values (M, ..., *batch)."""
     return jnp.where(lax.expand_dims(chosen, range(1, 1 + new.ndim - chosen.ndim)), new, old)
 
 
 def summed(weights: Array) -> Array:
-    """(E, A, *batch) to (E, *batch)."""
+    """Sum over the second axis: (E, A, *batch) to (E, *batch)."""
     return fold(jnp.add, weights, 1)
 
 
 def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
-    """Of A rows, for each of E slots that one of weight 1 (E, A, *batch); the first where there is none."""
+    """For each of E slots, the row (of A) whose weight (E, A, *batch) is 1; row 0 if none."""
 
     def filled(weights, total):
         first = lax.broadcasted_iota(weights.dtype, weights.shape, 1) == 0
@@ -144,8 +144,8 @@ def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
 def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
     """Sum over one of the two axes of constant weights (A, B, *batch) times values (A or B, F, *batch) along it.
 
-    Its transpose is the sum over the other axis, and is given as that: JAX's own would add up one padded term
-    after the other. `custom_linear_solve` is the way to state a transpose that all transformations know.
+    The transpose, the sum over the other axis, is given explicitly: JAX's own would add one padded term after the
+    other. `custom_linear_solve` states a transpose in a way that all transformations know.
     """
     size, batch = max(weights.shape[:2]), weights.shape[2:]
 
@@ -163,7 +163,7 @@ def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:
 def sum_of_terms(weights: Array, values: Array, axis: int) -> Array:
     """Sum over one of the two axes of weights (A, B, *batch) times values (A or B, F, *batch) along it.
 
-    Term by term: XLA's own reduction of such a product takes twice the time.
+    Term by term, which is faster than XLA's own reduction of such a product.
     """
 
     def add(total, term):

@@ -1,8 +1,8 @@
 """Limits, friction and motors of joints, as rows beside the contacts: each acts along the coordinate of one joint.
 
 A limit is a contact in one dimension, with the gap coordinate - lower or upper - coordinate; it is struck at its time
-within the step. Friction, or a motor, acts at the end of every step with what brings the rate to `speed`, but no more
-than its bound. Their numbers stand in the first component of the vectors of a contact.
+within the step. Friction, or a motor, acts at the end of every step with the impulse that brings the rate to `speed`,
+up to its bound. The scalars of a row are the first component of the vectors of a contact.
 """
 
 from collections.abc import Callable
@@ -24,11 +24,11 @@ from diffrigid.numerics import FOUND, implicit_root, safe_divide, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 
-SEARCH = 8  # steps of Newton's method, kept between the ends, for the time of a limit on a nearly straight line
+SEARCH = 8  # Newton steps, kept in their bracket, for the time at which a nearly straight path strikes a limit
 
 
 class Stop(NamedTuple):
-    """A row of each joint of a group."""
+    """One kind of row, which each joint of a group has."""
 
     group: int
     kind: str  # "lower", "upper" or "friction"
@@ -46,12 +46,12 @@ def stop_ends(world: Any, side: str) -> tuple[int, ...]:
 
 
 def is_drive(world: Any) -> tuple[bool, ...]:
-    """Of every row: friction or motor, not a limit."""
+    """Whether each row is friction or a motor, not a limit."""
     return tuple(stop.kind == "friction" for stop in stops_of(world) for _ in world.joints[stop.group].a)
 
 
 def of_stops(world: Any, field: str, kinds: tuple[str, ...], other: float, batch: tuple[int, ...]) -> Array:
-    """A number of the joints for every row of some kinds, and `other` for the rest, (R, *batch)."""
+    """Values of the joints' `field` for rows of these `kinds`, and `other` for the rest, (R, *batch)."""
     parts = []
     for stop in stops_of(world):
         group = world.joints[stop.group]
@@ -61,7 +61,7 @@ def of_stops(world: Any, field: str, kinds: tuple[str, ...], other: float, batch
 
 
 def meet_stops(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array) -> Meeting:
-    """When every limit is struck, or the end of the step; and every friction, which acts at all times.
+    """Meetings of all rows: when each limit is struck, or the end of the step; friction and motors act at the end.
 
     Args:
         at_end: bool; True: all at the end of the step.
@@ -77,7 +77,7 @@ def meet_stops(world: Any, flight: Flight, since: Array, dt: Array, at_end: Arra
 
 
 def find_stops(world: Any, flight: Flight, meeting: Meeting) -> Strikes:
-    """The rows of all joints when they are met."""
+    """Strikes of the rows of all joints, at their meetings."""
     padded, parts, start = _with_statics(world, flight), [], 0
     for stop in stops_of(world):
         group, sides = _rows_of(world, stop, padded)
@@ -108,10 +108,10 @@ def _gap(kind: str, joint: Any, a: Flight, b: Flight) -> Callable[[Array], Array
 def _struck(
     kind: str, dt: Array, at_end: Array, rest_speed: Array, joint: Any, a: Flight, b: Flight, since: Array
 ) -> Meeting:
-    """When a limit is struck, or the end of the step.
+    """Meeting of one row: when its limit is struck, or the end of the step.
 
-    On a path that goes back to `since`, before the step: so one that was missed there is still taken at its time. One
-    that is not open then but is passed at the end is touched at once.
+    The path is followed back to `since`, before the step: a limit that was missed there is still struck at its time.
+    One that is not open then, and exceeded at the end, is struck at once.
     """
     if kind == "friction":
         never = jnp.zeros(dt.shape, bool)
@@ -141,7 +141,7 @@ def _struck(
 
 
 def _rate(gap: Callable, s: Array) -> tuple[Array, Array]:
-    """Gap and its rate."""
+    """Gap at time s, and its rate."""
     return jax.jvp(gap, (s,), (jnp.ones_like(s),))
 
 
@@ -162,7 +162,7 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
     first = unit_vector(jnp.zeros((so.D, *s.shape), s.dtype), 0)
     none, gap = jnp.zeros_like(first), _gap(kind, joint, a, b)
     open_by = jnp.zeros_like(s) if kind == "friction" else gap(s)
-    if kind == "friction":  # in the mean since the paths begin
+    if kind == "friction":  # mean acceleration since the paths begin
         start = jnp.maximum(a.t0, b.t0)
         pull = safe_divide(rate - _rate(gap, start)[1], s - start)
     else:
@@ -177,7 +177,7 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
 
 
 def _second(gap: Callable, s: Array) -> Array:
-    """Second derivative by time."""
+    """Second time derivative of the gap."""
     one = jnp.ones_like(s)
     return jax.jvp(lambda s: jax.jvp(gap, (s,), (one,))[1], (s,), (one,))[1]
 

@@ -1,4 +1,4 @@
-"""The contacts of all pairs of a world, and the rows of its joints, as one list, whatever their kinds."""
+"""One list of all contacts of a world, whatever the kinds of their shapes, followed by the rows of its joints."""
 
 import functools
 from typing import Any
@@ -29,15 +29,15 @@ from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
 
-DEEPEST = 0.2  # [-] of the smaller reach: what is deeper inside each other is pushed apart in several steps
-ROUNDING = 1e2  # [-] of the last digit of a size, or of a tenth of a place: gaps are not known any better
+DEEPEST = 0.2  # [-] of the smaller reach: deeper penetration is resolved in several steps
+ROUNDING = 1e2  # [-] times eps times (size + a tenth of the coordinates): accuracy to which gaps are known
 
 
 def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array) -> Strikes:
-    """The contacts of every pair at its next impact, or where it is held until; all at the end where `at_end` (a bool).
+    """List the contacts of every pair at its next impact, or the time it is held until; `at_end` (bool): at the end.
 
-    Active are those that touch then; of the next impact, only if it happens before the end. What has rested (C, *batch)
-    still touches where it has opened by no more than a body falls in a step.
+    Active are contacts that touch then, those of an impact only if it happens before the end. A contact that was
+    `resting` (C, *batch) still touches if it has opened by no more than a body falls in a step.
     """
     width = world.contact.width
     groups = [sides_of(world, pairs, flight, since) for pairs in world.pairs]
@@ -65,7 +65,7 @@ def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Ar
 
 
 def _joined(parts: list[Strikes]) -> Strikes:
-    """All in one list; where some turn, all have how far."""
+    """Concatenate the lists; `turn`, if any has it, is zero in those that do not."""
     if len(parts) == 1:
         return parts[0]
     if any(part.turn is not None for part in parts):
@@ -75,9 +75,10 @@ def _joined(parts: list[Strikes]) -> Strikes:
 
 
 def waits(world: Any) -> bool:
-    """Whether what rests may have to be held until an impact. Static.
+    """Whether resting contacts may have to be held until an impact. Static.
 
-    It has if something acts on it, and it meets several others, or one of them in several points.
+    That is so beside friction or motors of joints, and with forces where a body may touch several others, or one of
+    them at several points.
     """
     column, drives = ends(world), driven(world)
     pairs = tuple(dict.fromkeys(zip(column["a"], column["b"], strict=True)))
@@ -87,7 +88,7 @@ def waits(world: Any) -> bool:
 
 
 def is_loaded(world: Any) -> bool:
-    """Whether what rests carries a load: something pulls at it. Static."""
+    """Whether resting contacts carry a load: there are forces, or friction or motors of joints. Static."""
     return bool(world.forces) or any(driven(world))
 
 
@@ -104,7 +105,7 @@ def next_strikes(world: Any, a: Side, b: Side, dt: Array) -> Strikes:
 
 
 def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loaded: bool) -> Strikes:
-    """The contacts of one pair, (K, ...); see `find_strikes`. They are `loaded` if forces act in this world."""
+    """Contacts of one pair, (K, ...); see `find_strikes`. `loaded`: whether resting contacts may carry a load."""
     s, held, live = meeting.s, meeting.held, opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
     contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
@@ -137,14 +138,14 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
 
 
 def relative_path_is_straight(world: Any, both_move: bool) -> bool:
-    """Whether a body's path is a straight line as seen from another: two fall alike, but not one and a static."""
+    """Whether relative paths are straight lines: two bodies may fall alike, but not a body and a static."""
     return is_uniform(world.forces) and not world.joints if both_move else not (world.forces or world.joints)
 
 
 def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
     """False (a bool) if no two bounding spheres of any pair in any world of the batch can touch within the step.
 
-    The test costs a fraction of looking for impacts, and spares a step without them everything else.
+    The test costs a fraction of the search for impacts, and lets a step without any skip everything else.
     """
     width = world.contact.width
     margin = 0.0 if width is None else 40.0 * width  # beyond it a smooth impulse is below rounding, exp(-40)
@@ -176,7 +177,7 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
 
 
 def ends(world: Any) -> dict[str, tuple[int, ...]]:
-    """Colliders a and b of every contact of the list, and of the rows of joints after them."""
+    """Colliders a and b of every contact, then of every row of a joint."""
 
     def column(of):
         return tuple(int(i) for pairs in world.pairs for i in np.repeat(of(pairs), pairs.count))
@@ -186,7 +187,7 @@ def ends(world: Any) -> dict[str, tuple[int, ...]]:
 
 
 def wholes(world: Any) -> tuple:
-    """Of every contact and row, which two rigid wholes it is between: what is welded is one, and so are the statics."""
+    """Label each contact or row by the two rigid clusters it connects (welded bodies are one; so are all statics)."""
     moving, count, pairs = len(world.names), contact_count(world), ends(world)
     whole = [min(body) for body in islands(ends_of(g for g in world.joints if isinstance(g, Weld)), moving)]
 
@@ -199,14 +200,14 @@ def wholes(world: Any) -> tuple:
 
 @pytree
 class Material:
-    """A coefficient of M colliders."""
+    """Values of one material coefficient for M colliders."""
 
     value: Array = array("M")  # (M, *batch) [-]
     given: Array = array("M")  # (M, *batch) 1 if it was given to the collider itself, 0 if it is the scene's
 
 
 def material(world: Any, name: str, colliders: tuple[int, ...]) -> Material:
-    """A coefficient, by its name, of colliders."""
+    """Look up the coefficient `name` for the given colliders."""
     moving, still = getattr(world.bodies, name), getattr(world.statics, name)
     batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
     values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
@@ -219,12 +220,12 @@ LAW = ("restitution", "friction", "restitution_falloff")
 
 
 def materials(world: Any, colliders: tuple[int, ...], names: tuple[str, ...] = LAW) -> list[Material]:
-    """Those of some coefficients that the world has; all of them are what `law` takes."""
+    """Look up those of `names` that the world has; by default the coefficients that `law` takes."""
     return [material(world, name, colliders) for name in names if getattr(world.bodies, name) is not None]
 
 
 def law(a: list[Material], b: list[Material], strike: Strikes) -> tuple[Array, Array]:
-    """Restitution and friction between two colliders, where they strike."""
+    """Coefficients of restitution and friction between two colliders at their impact."""
     e, mu, *falloff = map(mixed, a, b)
     if falloff:
         e = restitution_at(-jax.vmap(dot)(strike.normal, strike.v_rel), e, *falloff)
@@ -232,13 +233,13 @@ def law(a: list[Material], b: list[Material], strike: Strikes) -> tuple[Array, A
 
 
 def coefficients(world: Any, name: str, batch: tuple[int, ...]) -> Array:
-    """A coefficient, by its name, of all contacts and rows, (C, *batch) or what broadcasts."""
+    """Coefficient `name` of all contacts and rows of joints, (C, *batch) or broadcastable to it."""
     index = {side: ends(world)[side][: contact_count(world)] for side in "ab"}
     return _coefficients(world, name, index["a"], index["b"], batch)
 
 
 def _coefficients(world: Any, name: str, a: tuple[int, ...], b: tuple[int, ...], batch: tuple[int, ...]) -> Array:
-    """The same between colliders a and b, and behind them those of the rows of joints."""
+    """Coefficient `name` between colliders a and b, followed by that of the rows of joints."""
     parts = [mixed(*(material(world, name, side) for side in (a, b)))] if world.pairs else []
     if stops_of(world):
         kinds = ("lower", "upper") if name == "restitution" else ()
@@ -254,12 +255,12 @@ def is_rolling(world: Any) -> bool:
 
 
 def driven(world: Any) -> tuple[bool, ...]:
-    """Of all contacts and rows: friction or a motor of a joint, which acts to both sides, in every step."""
+    """Whether each contact or row is joint friction or a motor (two-sided, always active)."""
     return (False,) * contact_count(world) + is_drive(world)
 
 
 def driving(world: Any, target: Array) -> tuple[Array, Array | None]:
-    """`target` with the speeds of motors put in, and the most that friction and motors do [N or N m]; None: no such."""
+    """`target` with the speeds of motors filled in, and bounds of joint friction and motors [N or N m]; None: none."""
     if not any(is_drive(world)):
         return target, None
     drives = flags(is_drive(world), target)
@@ -270,10 +271,10 @@ def driving(world: Any, target: Array) -> tuple[Array, Array | None]:
 
 
 def contact_count(world: Any) -> int:
-    """Contacts of all pairs, without the rows of joints."""
+    """Number of contacts of all pairs, without the rows of joints."""
     return sum(len(pairs.a) * pairs.count for pairs in world.pairs)
 
 
 def mixed(a: Material, b: Material) -> Array:
-    """Coefficient of two colliders: the mean; but what was given to a collider outweighs what was not."""
+    """Mean of the coefficients of two colliders; one given to a collider itself outweighs the scene's."""
     return 0.5 * ((1.0 + a.given - b.given) * a.value + (1.0 + b.given - a.given) * b.value)

@@ -1,17 +1,17 @@
 """Contacts that share a body, solved together: velocities that do not close, and impulses inside the friction cone.
 
 With y the relative velocities at the contacts after all impulses P, k > 0 any number for each contact, and `allowed`
-what Coulomb allows of an impulse,
+the part of an impulse that Coulomb's law allows,
 
     P = allowed(z),   z = P - (y - target n) / k,   y = v_rel + W P,   W = J G J^T
 
-says at once that contacts do not pull, do not close, and slip only against all of their friction. Where contacts repeat
-each other, as four corners on a floor do, many P do. One of them is chosen by a small compliance e, which asks for the
-least impulses (those nearest to a guess):
+states at once that contacts do not pull, do not close, and slip only against their full friction. Where contacts are
+redundant, like four corners on a floor, many P satisfy it. A small compliance e selects one of them, with the least
+impulses (those nearest to a guess):
 
     z = P - e (P - rest) - (y - target n) / k,   rest: first the guess, then the P that this leads to
 
-The second P is as if nothing yielded, to the order of e^2. It is solved by Newton's method (`slope.py`), for both.
+The second P is that of rigid contacts, to the order of e^2. Both are found by Newton's method (`slope.py`).
 Source: Alart & Curnier, Computer Methods in Applied Mechanics and Engineering 92 (1991) 353, for the equation;
 Rockafellar, SIAM J. Control and Optimization 14 (1976) 877, for `rest`.
 """
@@ -33,47 +33,47 @@ from diffrigid.contact.slope import answer, newton_step, slope_at, sloped
 from diffrigid.gathers import fold
 from diffrigid.numerics import FOUND, safe_divide
 
-ROUNDS = 90  # at most, of Newton's method
-CIRCLES = 10  # rounds after which `solve_roughly` gives it another start: the first time
-ROUGH = 1e-2  # with this relative error, and then with as little as it can
+ROUNDS = 90  # of Newton's method, at most
+CIRCLES = 10  # rounds after which, each time, `solve_roughly` gives it another start: the first one
+ROUGH = 1e-2  # with this relative error, later ones with the least that it reaches
 PILE = 4  # bodies; with fewer the guess is near enough, it suffices to go back to the best, and less is compiled
 SMOOTHING = 3  # rounds before the first Newton step, in piles, and after one that gained little
-DOUBLES = 5  # Newton's rounds after which these are twice as many, where it does not get on
-SMOOTHEST = 384  # of them at most
-LITTLE = 0.9  # of the error before: a step that leaves more gained little
-PATIENCE = 3  # rounds that do not halve the error: then a small one is rounding, and else the best is smoothed
-# e: in double precision what leaves e^2 below rounding, in single precision what its own inverse allows.
+DOUBLES = 5  # Newton rounds after which the smoothing rounds are doubled, where it makes no progress
+SMOOTHEST = 384  # smoothing rounds, at most
+LITTLE = 0.9  # [-] of the error before: a step that leaves more gained little
+PATIENCE = 3  # rounds without halving the error: then a small one is rounding, and else the best is smoothed
+# e: in double precision such that e^2 is below rounding, in single precision as small as its inverse allows.
 COMPLIANCE, ROUNDINGS = 1.5e-8, 100.0
-REFINEMENTS = 4  # of the linear system of the derivative
+REFINEMENTS = 4  # iterative ones, of the linear system of the derivative
 
 
 def _excess(cone: Cone, P: Array, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
-    """z, (C, D, *batch) [N s]."""
+    """z without its term e rest, (C, D, *batch) [N s]."""
     y = v_rel + moved(P, arms, mobility)
     return (1.0 - _compliance(P)) * P - (y - cone.target[:, None] * cone.normal) / cone.scale[:, None]
 
 
 def _compliance(P: Array) -> float:
-    """e [-], what a contact yields to as a share of k P."""
+    """Compliance e [-]: a contact yields to P with the velocity e k P."""
     return max(COMPLIANCE, ROUNDINGS * float(jnp.finfo(P.dtype).eps))
 
 
 def _yielded(cone: Cone, P: Array) -> Array:
-    """Velocities (C, D, *batch) [m/s] to which compliance yields."""
+    """Velocities e k P with which compliant contacts yield to P, (C, D, *batch) [m/s]."""
     return _compliance(P) * cone.scale[:, None] * P
 
 
 class Newton(NamedTuple):
-    """How far Newton's method has come in every world of a batch."""
+    """State of Newton's method in every world of a batch."""
 
     count: Any  # int: rounds
-    rigid: Array  # (*batch) bool: the compliant solution is found, and nothing yields any more
-    rest: Array  # (C, D, *batch) [N s] impulses at which nothing is yielded to: the guess, and then that solution
-    tried: Array  # (*batch) bool: a step from here left the cones of contacts, so that another is tried
+    rigid: Array  # (*batch) bool: the compliant solution is found, and the rigid one is being solved
+    rest: Array  # (C, D, *batch) [N s] impulses at which contacts do not yield: the guess, then the compliant solution
+    tried: Array  # (*batch) bool: a step from here left the cones of contacts, so that another one is tried
     at: Array  # (C, D, *batch) [N s] where `allowed` is linearised: z, or where that step left a cone
     P: Array  # (C, D, *batch) [N s]
     z: Array  # its `_excess`
-    r: Array  # what P lacks: allowed(z) - P, linearised at `at`
+    r: Array  # residual allowed(z) - P, linearised at `at`
     best: Array  # of all P
     error: Array  # (*batch) [m/s] of the best
     since: Array  # (*batch) int: rounds since the error was halved
@@ -95,7 +95,7 @@ def solve_together(shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: 
 def _solutions(
     shared: Array, cone: Cone, v_rel: Array, guess: Array, arms: Arms, mobility: Mobility
 ) -> tuple[Array, Array]:
-    """Of `solve_together`, and of what is compliant."""
+    """Impulses of rigid and of compliant contacts, each (C, D, *batch) [N s]; see `solve_together`."""
 
     def solved(guess):
         at_guess = cone, v_rel - _yielded(cone, guess), arms, mobility
@@ -119,12 +119,12 @@ def _solutions(
 
 
 def _again(now: Newton, given: tuple[Cone, Array, Arms, Mobility]) -> Newton:
-    """A Newton step, from which P is brought back into the cones.
+    """Take a Newton step, and bring P back into the cones.
 
     Where it gains little
-        because contacts leave their cones: the step is taken again, these contacts linearised where it led them;
-        otherwise: half of the step is tried too, and the better of both smoothed;
-        again: the best P so far is smoothed, by more rounds the longer it takes;
+        because contacts leave their cones: the step is repeated, with these contacts linearised where it led them;
+        otherwise: half of the step is tried too, and the better of both is smoothed;
+        repeatedly: the best P so far is smoothed, by more rounds the longer it takes;
         for long, among four bodies or more: P may go round in circles, and another method gives it a new start.
     """
     cone, v_rel, arms, mobility = given
@@ -174,14 +174,14 @@ def _again(now: Newton, given: tuple[Cone, Array, Arms, Mobility]) -> Newton:
 
 
 def _yields(cone: Cone, now: Newton) -> Array:
-    """Whether the compliant solution is found, and yields to more than rounding, (*batch) bool."""
+    """Whether the compliant solution is found, and yields by more than rounding, (*batch) bool."""
     found = ~now.rigid & ~_lacks(cone, now) & (_speed(cone, now.r) <= now.error)
     yielded = _compliance(now.P) * _speed(cone, now.P - now.rest)
     return found & (yielded > 16.0 * jnp.finfo(now.P.dtype).eps * _speed(cone, now.P) + _least(cone))
 
 
 def _made_rigid(cone: Cone, now: Newton) -> Newton:
-    """Where what yields is found, nothing yields any more: the solution then is next to it."""
+    """Make contacts rigid where the compliant solution is found; the rigid solution is close to it."""
     found = _yields(cone, now)
 
     def rigid(now: Newton) -> Newton:
@@ -197,7 +197,7 @@ def _made_rigid(cone: Cone, now: Newton) -> Newton:
 def _elsewhere(
     now: Newton, given: tuple[Cone, Array, Arms, Mobility], lost: Array, P: Array, z: Array, r: Array, since: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Another start, by the method of multipliers, in worlds that are `lost`."""
+    """Restart the worlds that are `lost` from the method of multipliers."""
     cone = given[0]
 
     def wrong(P):
@@ -210,15 +210,15 @@ def _elsewhere(
 
 
 def _missing(P: Array, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> tuple[Array, Array]:
-    """z, and what P lacks to be what is allowed of it; (C, D, *batch) [N s]."""
+    """z and the residual allowed(z) - P, (C, D, *batch) [N s]."""
     z = _excess(cone, P, v_rel, arms, mobility)
     return z, allowed(cone, z) - P
 
 
 def _smoothed(P: Array, rounds: Any, cone: Cone, v_rel: Array, arms: Arms, mobility: Mobility) -> Array:
-    """After rounds in which each contact takes a share of the masses of its bodies (Tonge et al. 2012).
+    """P after smoothing rounds (projected Jacobi; each body's mass is split among its contacts, Tonge et al. 2012).
 
-    They go on in the direction of the round before (Nesterov 1983), unless that leads back (O'Donoghue & Candes 2015).
+    Rounds are accelerated by momentum (Nesterov 1983), which restarts where it leads back (O'Donoghue & Candes 2015).
     """
 
     def smoother(_, carry):
@@ -235,19 +235,19 @@ def _smoothed(P: Array, rounds: Any, cone: Cone, v_rel: Array, arms: Arms, mobil
 
 
 def _speed(cone: Cone, P: Array) -> Array:
-    """The largest change of velocity by impulses at their contacts, (*batch) [m/s]."""
+    """Largest change of velocity k P by impulses at their own contacts, (*batch) [m/s]."""
     return jnp.max(cone.scale * fold(jnp.maximum, jnp.abs(P), 1), 0)
 
 
 def _least(cone: Cone) -> Array:
-    """An error that is none, (*batch) [m/s]."""
+    """Error that counts as none, (*batch) [m/s]."""
     return jnp.finfo(cone.scale.dtype).eps ** 0.6 * cone.rest_speed
 
 
 def _lacks(cone: Cone, now: Newton) -> Array:
-    """Whether the best is not yet as good as rounding allows, (*batch) bool: the longer it takes, the less is asked.
+    """Whether the best is not yet as good as required, (*batch) bool: rounding at first, less the longer it takes.
 
-    Beside the compliant solution another one is soon found, or not at all.
+    Near the compliant solution the rigid one is found soon, or not at all.
     """
     rounding = jnp.finfo(now.P.dtype).eps
     first = rounding * jnp.where(now.rigid, 16.0, 1e3)
@@ -258,19 +258,19 @@ def _lacks(cone: Cone, now: Newton) -> Array:
 
 
 def _circles(cone: Cone, now: Newton) -> Array:
-    """Whether the error of the best is more than of rounding, (*batch) bool."""
+    """Whether the error of the best is larger than that of rounding, (*batch) bool."""
     return now.error > 3.0 * jnp.finfo(now.P.dtype).eps ** 0.5 * _speed(cone, now.best) + _least(cone)
 
 
 @_solutions.defjvp
 def _solutions_jvp(primals, tangents):
-    """With A = 1 - D ((1 - e) - W / k): A dP_1 = change of the compliant one, A dP = change + e D dP_1."""
+    """A dP_1 = change of the compliant solution P_1, A dP = change + e D dP_1; A = 1 - D ((1 - e) - W / k)."""
     shared, cone, v_rel, guess, arms, mobility = primals
     P, compliant = checkpoint_name(_solutions(*primals), FOUND)
     e = _compliance(P)
     yielding = _excess(cone, compliant, v_rel, arms, mobility) + e * guess
     z = _excess(cone, P, v_rel, arms, mobility) + e * compliant
-    # What creeps, or lets go, by as much as it yields does so in the limit too, where z is on the bound.
+    # A contact that slips, or separates, by as much as it yields does so in the limit too, where z is on the bound.
     slope, before = slope_at(cone, z, e), slope_at(cone, yielding, e)
     differs = (slope.on != before.on) | (slope.slides != before.slides)
     at = jnp.where(differs[:, None], yielding, z)

@@ -1,4 +1,4 @@
-"""Poses in files, in NumPy: x (3,) [m] and R (3, 3), from the axes of a frame to those around it."""
+"""Poses in files, in NumPy: x (3,) [m] and R (3, 3), from the axes of a frame to those of its parent."""
 
 from typing import NamedTuple
 
@@ -6,13 +6,13 @@ import numpy as np
 
 
 class Frame(NamedTuple):
-    """Where a frame is in another."""
+    """Pose of a frame in its parent."""
 
     x: np.ndarray = np.zeros(3)
     R: np.ndarray = np.eye(3)
 
     def __matmul__(self, inner: "Frame") -> "Frame":
-        """A frame inside this one, seen from around this one."""
+        """Pose in the parent of this frame of an `inner` one, given in this frame."""
         return Frame(self.x + self.R @ inner.x, self.R @ inner.R)
 
 
@@ -32,7 +32,7 @@ def from_quaternion(q: np.ndarray) -> np.ndarray:
 
 
 def to_quaternion(R: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) with w >= 0: the eigenvector of Bar-Itzhack's matrix (2000), good for any rotation."""
+    """Quaternion (w, x, y, z), w >= 0: the eigenvector of Bar-Itzhack's matrix (2000), good for any rotation."""
     (a, b, c), (d, e, f), (g, h, i) = R
     K = np.array(
         [
@@ -47,7 +47,7 @@ def to_quaternion(R: np.ndarray) -> np.ndarray:
 
 
 def from_euler(angles: np.ndarray, sequence: str) -> np.ndarray:
-    """Turns about x, y, z one after the other: lower case about the axes as they have turned, upper case fixed ones."""
+    """Successive rotations about x, y, z: lower case about the rotated axes, upper case about the fixed ones."""
     R = np.eye(3)
     for letter, angle in zip(sequence, angles, strict=True):
         turn = about(np.eye(3)["xyz".index(letter.lower())], angle)
@@ -56,7 +56,7 @@ def from_euler(angles: np.ndarray, sequence: str) -> np.ndarray:
 
 
 def from_axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """x as given; y made perpendicular to it."""
+    """Rotation with the x axis along x, and the y axis along y made perpendicular to it."""
     x = x / np.linalg.norm(x)
     y = y - (y @ x) * x
     y = y / np.linalg.norm(y)
@@ -64,7 +64,7 @@ def from_axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def onto(z: np.ndarray) -> np.ndarray:
-    """The least rotation that takes the z axis to this direction."""
+    """Smallest rotation that takes the z axis to this direction."""
     z = z / np.linalg.norm(z)
     axis, cosine = np.cross([0.0, 0.0, 1.0], z), z[2]
     size = np.linalg.norm(axis)

@@ -16,7 +16,7 @@ DENSITY = 1000.0  # [kg/m^3] of MuJoCo
 
 
 class Made(NamedTuple):
-    """A geom: its kind, a shape if it can collide, where that is, and its volume [m^3] and inertia per mass [m^2]."""
+    """A geom: its kind, a shape if it can collide, its pose, volume [m^3] and inertia per mass [m^2]."""
 
     kind: str
     shape: Any
@@ -53,7 +53,7 @@ def geometry_of(reader: Reader, R: np.ndarray) -> Made:
 
 
 def _solid(kind: str, frame: Frame, size: np.ndarray) -> Made:
-    """A solid of these half sizes; those of round ones are radius and half length along z."""
+    """Solid with these half sizes; for round ones, radius and half length along z."""
     if kind == "cylinder":
         radius, half = size
         across = radius**2 / 4 + half**2 / 3

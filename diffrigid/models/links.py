@@ -1,7 +1,7 @@
-"""Links, as files of robots have them, and the scene that they make.
+"""Links as in files of robots, and the scene made of them.
 
-A link has a frame of its own; mass, shapes and the joint to its parent are given in it. A `Body` has its axes in its
-centre of mass, and as its shape has them.
+A link has a frame of its own; mass, shapes and the joint to its parent are given in it. A `Body` has its origin at its
+centre of mass, and the axes of its shape.
 """
 
 import warnings
@@ -19,12 +19,12 @@ from diffrigid.shapes import HalfSpace
 from diffrigid.state import State
 from diffrigid.world import World
 
-CENTRED = 1e-6  # [-] of its size by which a shape may be off the centre of mass
+CENTRED = 1e-6  # [-] of a shape's size: how far it may be off the centre of mass
 
 
 @dataclass(frozen=True)
 class Mass:
-    """Mass [kg], its centre (3,) [m] and inertia (3, 3) [kg m^2] about that, in the axes of a link."""
+    """Mass [kg], its centre (3,) [m] and the inertia (3, 3) [kg m^2] about that, in the axes of a link."""
 
     mass: float
     center: np.ndarray
@@ -58,7 +58,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid part: where it is at the start, and what it is joined to (None: the world)."""
+    """A rigid part: its initial pose, and the link that it is joined to (None: the world)."""
 
     name: str
     frame: Frame
@@ -70,7 +70,7 @@ class Link:
 
 
 def total(parts: Sequence[Mass]) -> Mass:
-    """Several masses as one, by the parallel axis theorem."""
+    """Combine several masses into one, by the parallel axis theorem."""
     mass = sum(part.mass for part in parts)
     center = sum((part.mass * part.center for part in parts), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
@@ -95,7 +95,7 @@ def assemble(
     restitution: Any,
     contact: Contact | None,
 ) -> tuple[World, State]:
-    """The scene of these links.
+    """Make the scene of these links.
 
     Args:
         where: the file, for messages. left_out: what of it has no counterpart; one warning names all.
@@ -133,7 +133,7 @@ def assemble(
 
 
 def free_name(name: str, taken: Any, suffix: str) -> str:
-    """A name that `scene` takes: no dots, not reserved, not taken."""
+    """A name that `scene` accepts: no dots, not reserved, not taken."""
     name = name.replace(".", "_") or suffix.strip("_")
     while name in taken or name in (*RESERVED, "gravity"):
         name += suffix
@@ -141,7 +141,7 @@ def free_name(name: str, taken: Any, suffix: str) -> str:
 
 
 def _body(where: str, link: Link, skipped: list[str]) -> tuple[Body, Frame, Geometry | None]:
-    """A moving link as a body, its axes in the world, and the shape that it collides with."""
+    """Make a body of a moving link; return its axes in the world, and the shape that it collides with, too."""
     if link.mass is None or not link.mass.mass > 0:
         raise ValueError(f"{where}: {link.name!r} moves and has no mass: give it an inertial, or fix it.")
     mass, chosen = link.mass, None
@@ -167,7 +167,7 @@ def _body(where: str, link: Link, skipped: list[str]) -> tuple[Body, Frame, Geom
 
 
 def _joint(link: Link, frames: dict[str, Frame], skipped: list[str]) -> Any:
-    """The joint of a link to its parent, the world where that does not move."""
+    """Make the joint of a link to its parent, or to the world where the parent does not move."""
     joint, axes = link.joint, frames[link.name]
     parent = link.parent if link.parent in frames else None
     point, axis = link.frame.x + link.frame.R @ joint.point, link.frame.R @ joint.axis
@@ -187,7 +187,7 @@ def _joint(link: Link, frames: dict[str, Frame], skipped: list[str]) -> Any:
 
 
 def _are_told_apart(lower: float | None = None, upper: float | None = None) -> bool:
-    """Whether the angle of a hinge, known up to full turns, is 0 at the start, and between its limits within a turn."""
+    """Whether limits suit an angle known up to full turns: less than a turn, and about a middle within pi of 0."""
     spans = np.inf if lower is None or upper is None else upper - lower
     return abs(joints.middle_of(lower, upper)) < np.pi and not 2 * np.pi <= spans < np.inf
 

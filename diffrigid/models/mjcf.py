@@ -25,7 +25,7 @@ KINDS = ("hinge", "slide", "ball", "free")
 
 @dataclass
 class Model:
-    """What the whole file says, and what has been found of it."""
+    """Settings of the whole file, and what has been read from it so far."""
 
     where: str
     degrees: bool
@@ -38,24 +38,24 @@ class Model:
     names: set[str] = field(default_factory=set)
 
     def reader(self, element: ElementTree.Element, scope: str) -> Reader:
-        """The attributes of an element and those of its class."""
+        """Reader of the attributes of an element and of its class."""
         name = element.get("class", scope)
         if name not in self.classes:
             raise ValueError(f"{self.where}: <{element.tag}> has the class {name!r}, which is not in <default>.")
         return Reader(self.where, element.tag, {**self.classes[name].get(element.tag, {}), **element.attrib})
 
     def name_of(self, element: ElementTree.Element, default: str) -> str:
-        """The name of a body or geom, or one that is free."""
+        """Name of a body or geom, changed if it is taken."""
         name = free_name(element.get("name", default), self.names, "_")
         self.names.add(name)
         return name
 
 
-@np.errstate(over="ignore", invalid="ignore")  # `scene` refuses what is no number then
+@np.errstate(over="ignore", invalid="ignore")  # `scene` then refuses numbers that are not finite
 def load_mjcf(path: str | Path, *, restitution: Any = 0.0, contact: Contact | None = None) -> tuple[World, State]:
-    """World and state at the start of a MuJoCo file.
+    """Load a MuJoCo file: the world, and its initial state.
 
-    Every body becomes a `Body` of its name, with its axes in the centre of mass and along those of its geom; geoms of
+    Every body becomes a `Body` of its name, with its origin at the centre of mass and the axes of its geom; geoms of
     the world become statics. Bodies without a joint are welded to their parent. A contact takes the mean of the two
     sliding frictions, where MuJoCo takes the larger one.
 
@@ -105,7 +105,7 @@ def load_mjcf(path: str | Path, *, restitution: Any = 0.0, contact: Contact | No
 
 
 def _include(root: ElementTree.Element, folder: Path, parents: tuple[Path, ...]) -> None:
-    """Put in the place of each <include> what its file holds."""
+    """Replace each <include> by the content of its file."""
     for parent in list(root.iter()):
         for place, element in reversed(list(enumerate(parent))):
             if element.tag == "include":
@@ -122,12 +122,12 @@ def _include(root: ElementTree.Element, folder: Path, parents: tuple[Path, ...])
 
 
 def _merged(where: str, root: ElementTree.Element, tag: str) -> Reader:
-    """All elements of a section as one; later ones win."""
+    """Merge all elements of a section; later ones win."""
     return Reader(where, tag, {k: v for element in root.findall(tag) for k, v in element.attrib.items()})
 
 
 def _classes(where: str, root: ElementTree.Element) -> dict[str, dict[str, dict[str, str]]]:
-    """Attributes by class and element; a class has those of the class around it."""
+    """Attributes by class and element; a class inherits those of the class around it."""
     classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
 
     def walk(element: ElementTree.Element, outer: dict[str, dict[str, str]], default: str | None) -> None:
@@ -152,7 +152,7 @@ def _classes(where: str, root: ElementTree.Element) -> dict[str, dict[str, dict[
 
 
 def _children(model: Model, element: ElementTree.Element, parent: Link, scope: str) -> None:
-    """Read the geoms of the world, or the bodies in a body."""
+    """Read the bodies in an element, and the geoms if it is the world."""
     scope = element.get("childclass", scope)
     if odd := [child.tag for child in element if child.tag in BREAKING]:
         raise ValueError(f"{model.where}: <{odd[0]}> in {parent.name!r} cannot be loaded: write it out as bodies.")
@@ -180,7 +180,7 @@ def _body(model: Model, element: ElementTree.Element, parent: Link, scope: str) 
 
 
 def _rotation(model: Model, reader: Reader) -> np.ndarray:
-    """R of quat, axisangle, euler, xyaxes or zaxis."""
+    """Rotation R of quat, axisangle, euler, xyaxes or zaxis."""
     scale = np.pi / 180.0 if model.degrees else 1.0
     given = [name for name in ("quat", "axisangle", "euler", "xyaxes", "zaxis") if reader.given(name)]
     if len(given) > 1:
@@ -208,14 +208,14 @@ def _direction(reader: Reader, name: str, count: int, default: Any = None) -> np
 
 
 def _not_zero(reader: Reader, name: str, values: np.ndarray) -> np.ndarray:
-    """A direction, or several as columns."""
+    """Return a direction, or several as columns, after a check that none is zero."""
     if (np.abs(values).max(0) < 1 / largest(float)).any():
         raise ValueError(f"{reader.where}: {name} is zero: expected a direction.")
     return values
 
 
 def _mass(model: Model, element: ElementTree.Element, name: str, masses: list[Mass]) -> Mass | None:
-    """Of <inertial>, or the sum over the geoms."""
+    """Mass by <inertial>, or summed over the geoms."""
     inertial = element.find("inertial")
     if inertial is None or model.from_geoms == "true":
         return total(masses) if masses and model.from_geoms != "false" else None
@@ -283,7 +283,7 @@ def _joint(model: Model, element: ElementTree.Element, name: str, parent: Link, 
 
 
 def _driven(model: Model, reader: Reader, kind: str) -> Joint:
-    """A hinge or a slider, with its limits counted from where it is at the start."""
+    """A hinge or a slider, its limits counted from its initial position."""
     scale = np.pi / 180.0 if model.degrees and kind == "hinge" else 1.0
     lower = upper = None
     limited = reader.word("limited", "auto", "true", "false")
@@ -298,6 +298,6 @@ def _driven(model: Model, reader: Reader, kind: str) -> Joint:
 
 
 def _is_zero(reader: Reader, text: str) -> bool:
-    """Whether what is left out is a 0 that changes nothing."""
+    """Whether an attribute that is left out is 0, so that it changes nothing."""
     value = reader.attributes[text.split(" of ")[0]]
     return all(part.strip("+-0.") == "" for part in value.split())

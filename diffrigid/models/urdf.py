@@ -20,15 +20,15 @@ KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "fixe
 QUIET = ("material", "transmission", "gazebo")
 
 
-@np.errstate(over="ignore", invalid="ignore")  # `scene` refuses what is no number then
+@np.errstate(over="ignore", invalid="ignore")  # `scene` then refuses numbers that are not finite
 def load_urdf(
     path: str | Path, *, gravity: Any = (0.0, 0.0, -9.81), friction: Any = 0.0, restitution: Any = 0.0,
     contact: Contact | None = None, floating: bool = False,
 ) -> tuple[World, State]:  # fmt: skip
-    """World and state at the start, all joints at zero, of a URDF file.
+    """Load a URDF file: the world, and its initial state with all joints at zero.
 
-    Every link with an inertial becomes a `Body` of its name, with its axes in the centre of mass and along those of its
-    collision shape. A link without one that is fixed to another is a frame of that.
+    Every link with an inertial becomes a `Body` of its name, with its origin at the centre of mass and the axes of its
+    collision shape. A link without an inertial that is fixed to another one is a frame of that one.
 
     Args:
         gravity: (3,) [m/s^2]. friction, restitution: [-] of all links. contact: as in `scene`.
@@ -81,7 +81,7 @@ _WHOLE = Frame()
 
 
 def _link(where, name, element, places, mass, geometry, left_out, floating, called):
-    """The link, or the one that it is fixed to, and where it is in that."""
+    """Make a link, or take the one that it is fixed to; return it with the pose in it."""
     if element is None:
         moves = floating and mass is not None
         return Link(called, Frame(), None, Joint("free" if moves else "weld"), mass, geometry, not moves), _WHOLE
@@ -122,13 +122,13 @@ def _end(where: str, joint: ElementTree.Element, end: str, links: Any) -> str:
 
 
 def _reader(where: str, label: str, parent: ElementTree.Element, tag: str) -> Reader:
-    """The attributes of a child, none if there is no such child."""
+    """Reader of the attributes of a child, of none if there is no such child."""
     found = parent.find(tag)
     return Reader(where, f"{tag} of {label}", {} if found is None else dict(found.attrib))
 
 
 def _origin(where: str, label: str, element: ElementTree.Element) -> Frame:
-    """<origin xyz rpy>: roll, pitch and yaw about the fixed axes x, y, z."""
+    """Pose by <origin xyz rpy>: roll, pitch and yaw about the fixed axes x, y, z."""
     reader = _reader(where, label, element, "origin")
     return Frame(reader.numbers("xyz", 3, np.zeros(3)), from_euler(reader.numbers("rpy", 3, np.zeros(3)), "XYZ"))
 

@@ -1,4 +1,4 @@
-"""XML elements with numbers in their attributes, read with messages that name both."""
+"""Read XML elements with numbers in their attributes; error messages name both."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
@@ -8,11 +8,11 @@ import numpy as np
 
 from diffrigid.convert import largest
 
-DEEPEST = 200  # elements inside each other: a limit of Python's, which reads them one inside the other
+DEEPEST = 200  # nested elements: a limit of Python, which reads them recursively
 
 
 def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
-    """The root of a file; whatever it is called if `root` is None.
+    """Root element of a file; with `root` None it may have any tag.
 
     Raises:
         ValueError: it is no XML, its root is called otherwise, or elements are too deep inside each other.
@@ -32,7 +32,7 @@ def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
 
 
 class Reader:
-    """The attributes of one element; those that are never asked for are left out of the scene."""
+    """The attributes of one element; those never asked for are known to be left out of the scene."""
 
     def __init__(self, where: str, tag: str, attributes: dict[str, str]):
         self.where = f"{where}: <{tag}{_called(attributes)}>"
@@ -44,7 +44,7 @@ class Reader:
         return self.attributes.get(name, default)
 
     def word(self, name: str, default: str, *others: str) -> str:
-        """One of some words."""
+        """Value of an attribute that must be the default or one of some others."""
         text = self.text(name, default)
         if text not in (default, *others):
             raise ValueError(f"{self.where}: {name} is {text!r}: expected one of {', '.join((default, *others))}.")
@@ -54,7 +54,7 @@ class Reader:
         return name in self.attributes
 
     def numbers(self, name: str, count: int, default: Iterable[float] | None = None) -> np.ndarray:
-        """`count` numbers, (count,)."""
+        """Value of an attribute as `count` numbers, (count,)."""
         text = self.text(name)
         if text is None:
             if default is None:
@@ -66,7 +66,7 @@ class Reader:
         return values
 
     def some(self, name: str) -> np.ndarray:
-        """All numbers of an attribute, at least one."""
+        """Value of an attribute as numbers, at least one."""
         text = self.text(name) or ""
         try:
             values = np.array([float(part) for part in text.split()])
@@ -80,7 +80,7 @@ class Reader:
         return float(self.numbers(name, 1, None if default is None else [default])[0])
 
     def left_out(self, *ignored: str) -> list[str]:
-        """Attributes that nobody asked for, but for those that change no motion."""
+        """Attributes that were not asked for, except `ignored` ones, which change no motion."""
         return [f"{name} of {self.label}" for name in self.attributes if name not in {*self.asked, *ignored}]
 
 

@@ -1,4 +1,4 @@
-"""States at times that lie between those of a simulation and may be free."""
+"""States at times that lie between those of a simulation, and that may depend on free parameters."""
 
 from typing import Any
 
@@ -15,8 +15,8 @@ from diffrigid.world import World
 def states_at(world: World, states: State, lengths: Array, controls: Any, times: Array) -> State:
     """States at times (K, 1 or B) [s] since the first, from those after each step.
 
-    One more step, of the time that is missing, from the state before; so that what happens within it, an impact too, is
-    felt, and the derivative by the time is the velocity. Before the start, the free flight that leads to it.
+    One more step, of the missing time, from the state before: so what happens within it, even an impact, is included,
+    and the derivative with respect to time is the velocity. Before the start, the free flight that leads to it.
 
     Args:
         states: (S+1, N, ..., B). lengths: (S, B) [s]. controls: of each step, (S, size, 1 or B) by name.

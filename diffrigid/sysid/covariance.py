@@ -1,7 +1,7 @@
-"""How far fitted numbers may be off: covariances of z from the Jacobian, from clusters of residuals, and by resampling.
+"""Uncertainty of fitted numbers: covariances of z by the Jacobian, by clusters of residuals, and by resampling.
 
-Each is a function of a `Linear` and returns an `Uncertainty`: of the numbers that all records share. That of a record's
-own numbers follows from it (`own_covariance`).
+Each is a function of a `Linear` and returns the `Uncertainty` of the numbers that all records share. The covariance of
+a record's own numbers follows from it (`own_covariance`).
 """
 
 from collections.abc import Callable
@@ -10,24 +10,24 @@ from dataclasses import dataclass
 import numpy as np
 
 BLOCKS = 20  # pieces of time that stand for independent runs where there is only one record
-LEFT = 0.01  # of the information in some direction; if all clusters but one have less of it, they do not tell it
+LEFT = 0.01  # [-] of the information in a direction: if all clusters but one have less, they do not determine it
 DRAWS = 2000  # of the bootstrap
-MANY = 1e6  # degrees of freedom: Student's distribution is the normal one
+MANY = 1e6  # degrees of freedom for which Student's distribution is the normal one
 
 
 @dataclass(frozen=True)
 class Linear:
-    """A fit about its best point: residuals in standard deviations and their derivatives, record by record.
+    """A fit linearised at its best point: residuals in standard deviations and Jacobians, record by record.
 
-    With a robust loss the residuals are rho'(r) over the mean of rho''(r): what least squares would have to see to move
-    as the fit does. Source: Huber and Ronchetti, Robust Statistics, 2009, section 7.6.
+    With a robust loss the residuals are pseudo-residuals rho'(r) over the mean of rho''(r), with which least squares
+    moves as the fit does. Source: Huber and Ronchetti, Robust Statistics, 2009, section 7.6.
     """
 
     rows: tuple[np.ndarray, ...]  # of each record, (m,) residuals, those missing left out
-    slopes: tuple[np.ndarray, ...]  # of each record, (m, a + b)
+    slopes: tuple[np.ndarray, ...]  # of each record, (m, a + b) Jacobian
     times: tuple[np.ndarray, ...]  # of each record, (m,) [s]; NaN for a prior
     shared: int  # a
-    variance: float  # of the residuals: 1, or what it is with a robust loss
+    variance: float  # of the residuals: 1, or estimated with a robust loss
     estimated: bool  # the noise comes from the residuals
 
 
@@ -43,24 +43,24 @@ Intervals = Callable[[Linear], Uncertainty]
 
 
 def from_jacobian(linear: Linear) -> Uncertainty:
-    """(J^T J)^-1: right where residuals are independent and the model holds. The usual one."""
+    """Covariance (J^T J)^-1: right where residuals are independent and the model holds. The usual one."""
     numbers = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
     freedom = max(sum(map(len, linear.rows)) - numbers, 1) if linear.estimated else MANY
     return Uncertainty(linear.variance * inverse(information(linear)), float(freedom))
 
 
 def information(linear: Linear) -> np.ndarray:
-    """J^T J of the shared numbers, (a, a), those of each record eliminated."""
+    """Information J^T J of the shared numbers, (a, a), with the own numbers of each record eliminated."""
     return np.sum(_blocks(linear)[0], axis=0)
 
 
 def sandwich(linear: Linear) -> Uncertainty:
-    """From how far each record pulls: right where the model is wrong, or residuals go together within a record.
+    """Covariance by the scores of records: right where the model is wrong, or residuals correlate within a record.
 
     Leaves out each record in turn, to first order; with one record, each of 20 pieces of its time, which is right if
-    residuals of different pieces are independent; likewise where one record tells nearly all of some number. What a
-    single piece tells has the variance of `from_jacobian`. Source: jackknife of clusters, CR3 of Bell and McCaffrey
-    2002.
+    residuals of different pieces are independent; likewise where one record alone determines some number. What a
+    single piece determines has the variance of `from_jacobian`. Source: jackknife of clusters, CR3 of Bell and
+    McCaffrey 2002.
 
     Example:
         >>> careful = found.with_intervals(dr.sandwich)["restitution"]  # of one record: by pieces of its time
@@ -118,14 +118,14 @@ def _root(matrix: np.ndarray) -> np.ndarray:
 
 
 def _inverted(share: np.ndarray) -> np.ndarray:
-    """Inverse of a share of all information, which is 1 in every direction; 0 in those in which hardly any is left."""
+    """Invert a share of the total information, scaled to 1 in every direction; 0 in directions with hardly any left."""
     sizes, vectors = np.linalg.eigh(share)
     left = sizes > LEFT
     return vectors[:, left] / sizes[left] @ vectors[:, left].T
 
 
 def _told_by_one(H: list[np.ndarray], root: np.ndarray) -> np.ndarray:
-    """The part of the inverse of all information in directions of which one cluster has nearly all."""
+    """Part of the inverse of the total information, in directions in which one cluster has nearly all of it."""
     out = np.zeros((len(root), len(root)))
     for h in H:
         shares, vectors = np.linalg.eigh(root.T @ h @ root)
@@ -147,13 +147,13 @@ def student_quantile(freedom: float, probability: float = 0.975) -> float:
 
 
 def _blocks(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """For each record: information on the shared numbers, and their pull, with its own numbers eliminated."""
+    """Information and score of the shared numbers for each record, with its own numbers eliminated."""
     found = [eliminated(linear, k) for k in range(len(linear.rows))]
     return [J.T @ J for J, _ in found], [-J.T @ r for J, r in found]
 
 
 def _clusters(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """As `_blocks`; for pieces of time if there is one record, or one that tells nearly all of something."""
+    """Information and score per cluster: per record, or per piece of time if there is one record, or one dominates."""
     H, pull = _blocks(linear)
     if len(H) > 1 and not _told_by_one(H, _root(np.sum(H, axis=0))).any():
         return H, pull
@@ -168,7 +168,7 @@ def _clusters(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def eliminated(linear: Linear, record: int) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes by the shared numbers (m, a) and residuals of a record, freed of what its own numbers can explain."""
+    """Project a record's own numbers out of its Jacobian by the shared numbers (m, a) and out of its residuals (m,)."""
     J, r = linear.slopes[record], linear.rows[record]
     own = J[:, linear.shared :]
     if own.shape[1] == 0:

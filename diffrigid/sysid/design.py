@@ -1,4 +1,4 @@
-"""Design of experiments: what a planned record would tell, and the launch that tells most."""
+"""Design of experiments: the intervals that a planned record would give, and the launch that gives the narrowest."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,17 +20,17 @@ from diffrigid.sysid.setup import Problem, first_numbers, make_problem, make_sta
 from diffrigid.sysid.summary import Parameter
 from diffrigid.world import World
 
-NUDGE = 1e-3  # of z, for differences
-SHRINK, GROW = 0.5, 1.5  # of the length of a step that loses, or gains
+NUDGE = 1e-3  # change of z for differences
+SHRINK, GROW = 0.5, 1.5  # factor on the length of a step that loses, or gains
 
 
 @dataclass(frozen=True)
 class Launch:
-    """A planned record: its scene, what its launch is, and the intervals that it would give."""
+    """A planned record: its scene, the values of its launch, and the intervals that it would give."""
 
     world: World
     state: State
-    values: dict[str, np.ndarray]  # of what was varied
+    values: dict[str, np.ndarray]  # of the varied parameters, by name
     parameters: tuple[Parameter, ...]  # at their present values, with the interval to expect
     score: float  # mean logarithm of the standard deviations of z; -1 is intervals e times as narrow
 
@@ -60,7 +60,7 @@ def blind_spots(
     world: World, state: State, observations: Any, *, free: Mapping[Any, Any], noise: Mapping[str, Any] | None = None,
     observe: Mapping[str, Any] | None = None, dt: float | None = None,
 ) -> tuple[str, ...]:  # fmt: skip
-    """What these observations cannot tell, in words, before any fit: at the values of the scene. Arguments of `fit`.
+    """Say what these observations cannot determine, before any fit, at the values of the scene. Arguments of `fit`.
 
     Example:
         >>> made, start = dr.scene({"ball": ball}, forces={"spring": spring})
@@ -99,7 +99,7 @@ def best_launch(
         return np.concatenate([s.kind.draw(a, random) if k else s.kind.unbounded(a) for s, a in pairs])
 
     def scores(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of launches u (starts, count), and their gradients."""
+        """Scores of launches u (starts, count), and their gradients."""
         shifts = np.concatenate([np.zeros((1, count)), NUDGE * np.eye(count), -NUDGE * np.eye(count)])
         points = (u[:, None] + shifts[None]).reshape(lanes, count)
         states = [put(slots, scene, jnp.asarray(p, scene.state.x.dtype)).state for p in points]
@@ -144,7 +144,7 @@ def _shape(world: World, name: str, values: Any, t: np.ndarray, observe: Any) ->
 
 
 def _linears(problem: Problem) -> list[Linear]:
-    """Each record alone."""
+    """Linearisation of each record alone."""
     point = point_at(problem.groups, make_starts(problem, 1, 0))
     linear = linear_of(problem, point, 0, Squares(), False)
     rows = zip(linear.rows, linear.slopes, linear.times, strict=True)
@@ -152,19 +152,19 @@ def _linears(problem: Problem) -> list[Linear]:
 
 
 def _blind(problem: Problem, record: int, linear: Linear) -> list[Blind]:
-    """What a record does not see."""
+    """Directions of z that a record does not determine."""
     slots, scene = (*problem.shared, *problem.own), scene_of(problem.runs[record])
     return blind_directions(linear, coordinates(slots, [np.asarray(reference(slot, scene)) for slot in slots]))
 
 
 def _covariance(problem: Problem, record: int, linear: Linear) -> np.ndarray:
-    """Of the shared numbers, infinite where a record does not see them."""
+    """Covariance of the shared numbers, infinite where a record does not determine them."""
     blind, shared = _blind(problem, record, linear), slice(0, linear.shared)
     return infinite_where_blind(from_jacobian(linear).covariance, blind, shared)
 
 
 def _score(covariance: np.ndarray) -> float:
-    """Mean logarithm of the standard deviations along the axes of the ellipsoid; large if one has no end."""
+    """Mean logarithm of the standard deviations along the axes of the ellipsoid; large if one is infinite."""
     if not np.isfinite(covariance).all():
         return MANY
     sign, logarithm = np.linalg.slogdet(covariance)

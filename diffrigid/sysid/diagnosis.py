@@ -1,4 +1,4 @@
-"""What the data cannot tell, in words, and whether residuals are as noise should be."""
+"""What the data cannot determine, in words, and whether residuals look like noise."""
 
 import math
 from collections.abc import Sequence
@@ -10,17 +10,17 @@ from diffrigid.sysid.covariance import Linear, eliminated
 from diffrigid.sysid.free import Free
 
 ALIKE = 1e-8  # [-] eigenvalue of the scaled information below which effects are the same: a correlation of 1 - 1e-8
-ROUNDING = 1e-12  # [-] of the largest effect: what has no more has none
-SMALL = 0.05  # [-] parts of a direction below this of its largest are rounding, each as large as its effect
-LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that says nothing of it
+ROUNDING = 1e-12  # [-] of the largest effect: a smaller one is none
+SMALL = 0.05  # [-] parts of a direction below this share of its largest are rounding, each as large as its effect
+LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that hardly determines it
 RARE = 1e-3  # chance below which residuals are not taken for noise
-LAGS = 5  # frames over which residuals are compared with themselves
-ANY = 20.0  # standard deviations of a logarithm: of factors from there on nobody needs to know how large
+LAGS = 5  # largest lag of the autocorrelation of residuals
+ANY = 20.0  # standard deviation of a logarithm from which on the factor is not given
 
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One number of z: the parameter that it belongs to."""
+    """The parameter that one number of z belongs to."""
 
     name: str
     path: str
@@ -38,12 +38,12 @@ class Blind:
 
 
 def coordinates(slots: Sequence, references: Sequence[np.ndarray]) -> list[Coordinate]:
-    """The numbers of z, in order."""
+    """Coordinates of all numbers of z, in order."""
     out = []
     for slot, reference in zip(slots, references, strict=True):
         log = isinstance(slot.kind, Free) and slot.kind.low == 0 and not np.isfinite(slot.kind.high)
         sizes = slot.kind.scale(reference)
-        shape = np.shape(reference) if np.size(reference) == slot.size else (slot.size,)  # of what has charts: z's own
+        shape = np.shape(reference) if np.size(reference) == slot.size else (slot.size,)  # of charts: that of z
         for k, index in enumerate(np.ndindex(shape)):
             name = slot.name if slot.size == 1 else f"{slot.name}[{', '.join(map(str, index))}]"
             out.append(Coordinate(name, slot.name, log, float(sizes[k])))
@@ -51,9 +51,9 @@ def coordinates(slots: Sequence, references: Sequence[np.ndarray]) -> list[Coord
 
 
 def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[Blind]:
-    """Directions of z that nothing measured depends on: of the shared numbers with those of the first record.
+    """Directions of z, of shared numbers and those of the first record, that nothing measured depends on.
 
-    The columns of the Jacobian are scaled to length one; a direction in which they cancel is one that is not seen.
+    The columns of the Jacobian are scaled to length one; a direction in which they cancel is not determined.
     """
     J = _first_record(linear, len(coordinates))
     sizes = np.sqrt((J**2).sum(0))
@@ -79,10 +79,10 @@ def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[
 
 
 def reduced(rows: np.ndarray) -> np.ndarray:
-    """Another basis of what the rows span, (k, n): each row has a number that is 1 there and 0 in the others.
+    """Reduce the rows (k, n) to another basis of their span: each has a number that is 1 there and 0 in the others.
 
-    Directions that have nothing to do with each other, which an eigenvector may mix, come apart. Source: Gauss-Jordan
-    elimination with complete pivoting.
+    Unrelated directions, which an eigenvector may mix, are separated. Source: Gauss-Jordan elimination with complete
+    pivoting.
     """
     rows, left = rows.copy(), list(range(len(rows)))
     while left:
@@ -95,9 +95,9 @@ def reduced(rows: np.ndarray) -> np.ndarray:
 
 
 def _first_record(linear: Linear, numbers: int) -> np.ndarray:
-    """Slopes by the shared numbers and the own ones of the first record, rows of all records.
+    """Jacobian by the shared numbers and those of the first record, with the rows of all records.
 
-    Rows of the other records are freed of what their own numbers can explain.
+    The own numbers of the other records are projected out of their rows.
     """
     others = [eliminated(linear, k)[0] for k in range(1, len(linear.rows))]
     wide = [np.concatenate([rest, np.zeros((len(rest), numbers - linear.shared))], axis=1) for rest in others]
@@ -111,7 +111,7 @@ def _blind(direction: np.ndarray, coordinates: Sequence[Coordinate]) -> Blind:
 
 
 def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
-    """What is seen of a few numbers that change together, and what is not."""
+    """Describe what is determined of a few numbers that change together, and what is not."""
     names = [c.name for c, _ in parts]
     steps = np.array([v for _, v in parts])
     steps = steps / steps[np.argmax(np.abs(steps))]
@@ -137,7 +137,7 @@ def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
 
 
 def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate]) -> list[str]:
-    """Shared parameters of which the data say next to nothing, though something."""
+    """Notes on shared parameters that the data determine, but hardly."""
     deviation = np.sqrt(np.diag(covariance))
     hidden = [(c, s) for c, s in zip(coordinates, deviation, strict=True) if LARGE * c.scale < s < np.inf]
 
@@ -151,7 +151,7 @@ def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate]) -> list[str]
 
 
 def correlations(covariance: np.ndarray) -> np.ndarray:
-    """Correlation matrix (n, n); rows of what has no variance are zero."""
+    """Correlation matrix (n, n); rows of numbers without variance are zero."""
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(deviation > 0, deviation, np.inf)
     return covariance / safe / safe[:, None]
@@ -161,11 +161,11 @@ def correlations(covariance: np.ndarray) -> np.ndarray:
 
 
 def whiteness(series: Sequence[np.ndarray]) -> float:
-    """Chance that residuals that go as much with those just before them come from independent noise.
+    """Chance (p-value) of autocorrelations as large as those of the residuals in independent noise.
 
     The autocorrelations of n numbers are normal with variance 1 / n about 0; those over 5 lags are summed, over all
-    series. One-sided: what a model misses makes neighbours alike, while the numbers that are fitted make them a little
-    unlike, so that many short series of noise are not doubted. NaN is left out of the products.
+    series. One-sided: errors of a model make neighbours alike, while the fitted numbers make them slightly unlike, so
+    that many short series of noise are not doubted. NaN is left out of the products.
     """
     total, count = 0.0, 0
     for r in series:
@@ -178,7 +178,7 @@ def whiteness(series: Sequence[np.ndarray]) -> float:
 
 
 def normality(r: np.ndarray) -> float:
-    """Chance of such skewness and tails in normal noise. Source: Jarque and Bera 1987."""
+    """Chance (p-value) of such skewness and kurtosis in normal noise. Source: Jarque and Bera 1987."""
     r = r[np.isfinite(r)]
     if len(r) < 20 or np.std(r) == 0:
         return 1.0
@@ -188,12 +188,12 @@ def normality(r: np.ndarray) -> float:
 
 
 def doubts(series: Sequence[np.ndarray], expected: float | None, robust: bool = False) -> list[str]:
-    """Why intervals that take residuals as independent normal noise should not be believed; empty if they may be.
+    """Reasons to doubt intervals that take residuals as independent normal noise; empty if there are none.
 
     Args:
         series: residuals in standard deviations, one array a component of a column, in order of time.
         expected: mean square that they should have; None if the noise was estimated from them.
-        robust: whether the loss minds the tails less already.
+        robust: whether the loss already gives the tails less weight.
     """
     out = []
     if (p := whiteness(series)) < RARE:
@@ -207,7 +207,7 @@ def doubts(series: Sequence[np.ndarray], expected: float | None, robust: bool = 
 
 
 def infinite_where_blind(covariance: np.ndarray, blind: Sequence[Blind], numbers: slice) -> np.ndarray:
-    """Covariance of some numbers of z, with infinite variance for those of a direction that is not seen."""
+    """Covariance of some numbers of z, with infinite variance for those of an undetermined direction."""
     parts = np.zeros(len(covariance), bool)
     for b in blind:
         parts |= b.direction[numbers] != 0

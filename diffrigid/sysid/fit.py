@@ -33,7 +33,7 @@ from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 
 SQUARES = Squares()
-ALIKE = 0.5, 1e-3  # of the loss, and of the best: a start that ends within both of the best one agrees with it
+ALIKE = 0.5, 1e-3  # of the loss, and of the best loss: a start that ends within their sum agrees with the best
 
 
 def fit(
@@ -113,7 +113,7 @@ def fit(
     estimate, early = bool(problem.noise), ""
     point: Any = None
     for number, (width, window) in enumerate(stages):
-        # Twice if noise is estimated: with the guess, then with what the residuals say.
+        # Twice if noise is estimated: with the guess, then with the estimate from the residuals.
         for again in range(2 if estimate and number == len(stages) - 1 else 1):
             noise_now = estimated_noise(problem, point, loss) if again else problem.noise
             problem = with_noise(problem, noise_now, window, width)
@@ -128,7 +128,7 @@ def fit(
 
 
 def _stages(widths: Sequence[float], windows: Sequence[float]) -> list[tuple[float, float]]:
-    """(width, window) of the fits that follow each other."""
+    """(width, window) of the successive fits."""
     wide, long = _lengths("widths", widths, "[m], the last one usually 0"), _lengths("windows", windows, "[s]")
     if not (long > 0).all():
         raise ValueError(f"windows is {windows!r}, expected times > 0 [s], the last one usually inf")
@@ -136,7 +136,7 @@ def _stages(widths: Sequence[float], windows: Sequence[float]) -> list[tuple[flo
 
 
 def _lengths(name: str, values: Any, unit: str) -> np.ndarray:
-    """Some numbers >= 0, (n,); times may be inf."""
+    """Check and convert numbers >= 0, (n,); times may be inf."""
     array = np.asarray(numbers(name, values, None, finite=name == "widths"))
     if array.ndim != 1 or not array.size or not (array >= 0).all():
         raise ValueError(f"{name} is {values!r}, expected a sequence of numbers >= 0 {unit}")
@@ -159,7 +159,7 @@ def _check_parts(loss: Any, solver: Any, intervals: Any, seed: Any, resume: Any)
 def finish(
     problem: Problem, point: Point, loss: Any, intervals: Intervals, seed: int, began: float, remarks: list[str]
 ) -> Fit:
-    """The result at the best start, with noise as the residuals say."""
+    """Make the result at the best start, with noise estimated from the residuals."""
     if problem.noise:
         noise = estimated_noise(problem, point, loss)
         point, problem = rescaled(problem, point, noise), with_noise(problem, noise)
@@ -191,8 +191,8 @@ def finish(
 def estimated_noise(problem: Problem, point: Point, loss: Any) -> dict[str, float]:
     """Standard deviation of the residuals of each column whose noise is not given, at the best start.
 
-    Each column gives up as many numbers as its residuals say of the parameters (the trace of its part of the hat
-    matrix), so that the estimate is without bias. With a robust loss, from the median of the absolute values.
+    Each column loses as many degrees of freedom as its residuals determine numbers (the trace of its part of the hat
+    matrix), so that the estimate is unbiased. With a robust loss, from the median of the absolute values.
     """
     best = int(np.argmin(np.asarray(cost_of(loss, point.residuals))))
     linear, residuals = linear_of(problem, point, best, loss, True), by_column(problem, point, best)
@@ -207,7 +207,7 @@ def estimated_noise(problem: Problem, point: Point, loss: Any) -> dict[str, floa
 
 
 def _lost(problem: Problem, linear: Linear) -> dict[str, float]:
-    """How many numbers the residuals of each column determine: sum of their leverages."""
+    """Number of parameters that the residuals of each column determine: the sum of their leverages."""
     lost = dict.fromkeys(problem.noise, 0.0)
     shared = inverse(information(linear))
     for group in problem.groups:
@@ -232,7 +232,7 @@ def leverages(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
 
 
 def rescaled(problem: Problem, point: Point, noise: Mapping[str, float]) -> Point:
-    """A point as it would be with another noise."""
+    """Rescale the residuals and Jacobians of a point to another noise."""
     residuals, jacobians = [], []
     for group, r, jac in zip(problem.groups, point.residuals, point.jacobians, strict=True):
         ratios = []
@@ -249,7 +249,7 @@ def rescaled(problem: Problem, point: Point, noise: Mapping[str, float]) -> Poin
 
 
 def _all_noise(problem: Problem) -> dict[str, float]:
-    """Noise by column: estimated, or the median of what was given."""
+    """Noise by column: estimated, or the median of the given one."""
     noise = dict(problem.noise)
     for run in problem.runs:
         for name in run.channels:
@@ -258,7 +258,7 @@ def _all_noise(problem: Problem) -> dict[str, float]:
 
 
 def _refuse_blind(problem: Problem, linear: Linear) -> None:
-    """A parameter that no residual depends on is an error, not a number with an infinite interval."""
+    """Raise ValueError for a parameter that no residual depends on, instead of a number with an infinite interval."""
     sizes = sum((slopes**2).sum(0) for slopes in linear.slopes)
     for slot, size in zip((*problem.shared, *problem.own), split((*problem.shared, *problem.own), sizes), strict=True):
         if not np.any(size > 0):
@@ -270,7 +270,7 @@ def _refuse_blind(problem: Problem, linear: Linear) -> None:
 
 
 def _printer(progress: bool | None, starts: int) -> Callable[[int, np.ndarray], None]:
-    """Prints the iteration and the best cost, over one line."""
+    """Make a function that prints the iteration and the best cost, over one line."""
     if progress is None:
         progress = sys.stdout.isatty() or "ipykernel" in sys.modules
 

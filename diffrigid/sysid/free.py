@@ -1,4 +1,4 @@
-"""What may vary in a fit: the map from unbounded numbers z to a parameter, and where random starts lie.
+"""Kinds of free parameters: the map from unbounded numbers z to a parameter, and the spread of random starts.
 
 A kind of parameter is a frozen record with the verbs
 
@@ -7,11 +7,11 @@ A kind of parameter is a frozen record with the verbs
     unbounded(reference)      the z whose value is the reference, pulled off its bounds
     draw(reference, random)   z of a random start
     at_bound(value)           true if a result lies on a bound
-    log_volume(z, reference)  log |d value / d z|: how much of the parameter a volume of z is
+    log_volume(z, reference)  log |d value / d z|: volume of the parameter per volume of z
     check(where, value)       raises ValueError for a start that the kind does not allow
-    scale(reference)          (k,) a change of z that is large: what the data cannot tell is measured by it
+    scale(reference)          (k,) a large change of z: the measure of how well the data determine it
 
-`each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds what is known beforehand.
+`each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds prior knowledge.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ PULL = 1e-3  # a start on the bound of a positive parameter begins this far abov
 
 @dataclass(frozen=True)
 class Free:
-    """A free parameter: any real number, one > low, or one between low and high. `spread` is that of the starts."""
+    """A free parameter: any real number, one > low, or one between low and high. `spread` is that of random starts."""
 
     low: float = -np.inf
     high: float = np.inf
@@ -135,7 +135,7 @@ class Each:
 
 @dataclass(frozen=True)
 class Prior:
-    """A parameter of which something is known: normal about `mean`, with a standard deviation, in its unit."""
+    """A parameter with a prior: normal about `mean`, with a standard deviation, in its unit."""
 
     kind: Any
     mean: Any  # a number or a tuple
@@ -197,7 +197,7 @@ def rotation(spread: float = 0.5) -> Chart:
 
 
 def inertia(spread: float = 0.3, *, principal: bool = False) -> Chart:
-    """A (3, 3) inertia that stays one of a mass distribution: {"die.inertia": inertia()}.
+    """A (3, 3) inertia that remains that of a mass distribution: {"die.inertia": inertia()}.
 
     Args:
         principal: True: the principal axes stay as they are, as those of a body with planes of symmetry; three numbers
@@ -226,7 +226,7 @@ def shares(spread: float = 0.5) -> Chart:
 
 
 def each(kind: Any) -> Each:
-    """Of many records, each with its own value: {"ball.v": each(real())}.
+    """A parameter with a value of its own in each record: {"ball.v": each(real())}.
 
     Example:
         >>> own = {"restitution": dr.interval(0, 1), "ball.v": dr.each(dr.real())}
@@ -254,12 +254,12 @@ def prior(kind: Any, mean: Any, deviation: Any) -> Prior:
 
 
 def _spread(spread: Any) -> float:
-    """How far random starts are away."""
+    """Check the spread of random starts."""
     return float(coefficient("spread", spread))
 
 
 def _sigmoid(z: np.ndarray) -> np.ndarray:
-    """In NumPy, without overflow: a result has a few numbers, and JAX would compile for each of them."""
+    """Sigmoid in NumPy, without overflow: for the few numbers of a result, each of which JAX would compile."""
     small = np.exp(-np.abs(z))
     return np.where(z >= 0, 1.0, small) / (1.0 + small)
 
@@ -300,7 +300,7 @@ def _moments_size(shape: tuple[int, ...]) -> int:
 
 
 def _second_moments(inertia: Array) -> Array:
-    """S = integral of r r^T dm, of which I = tr(S) 1 - S."""
+    """Second moments S = integral of r r^T dm, for which I = tr(S) 1 - S."""
     return 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=inertia.dtype) - inertia
 
 
@@ -309,13 +309,13 @@ def _inertia_of(moments: Array) -> Array:
 
 
 def _principal_moments(z: Array, reference: Array) -> Array:
-    """The second moments S along their own axes, each times exp(z)."""
+    """Inertia with the second moments S along their principal axes scaled, each by exp(z)."""
     sizes, axes = jnp.linalg.eigh(_second_moments(reference))
     return _inertia_of((axes * (sizes * jnp.exp(z))[None]) @ axes.T)
 
 
 def _physical_inertia(z: Array, reference: Array) -> Array:
-    """With the second moments S, I = tr(S) 1 - S is physical if S is positive definite.
+    """Inertia I = tr(S) 1 - S of second moments S that stay positive definite, so that I is physical.
 
     S = C T T^T C^T with the Cholesky factor C of that of the reference and T lower triangular, exp(z) on its diagonal.
     Source: Wensing, Kim, Slotine, Linear Matrix Inequalities for Physically Consistent Inertial Parameters, 2018.

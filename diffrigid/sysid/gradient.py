@@ -19,7 +19,7 @@ from diffrigid.step import at_least_one
 from diffrigid.sysid.levenberg import INTERRUPTED, UNFINISHED, Numbers, Point, point_at
 from diffrigid.sysid.problem import Group, Plan, residuals_of
 
-ARMIJO = 1e-4  # [-] of the decrease that the slope promises: what a step of L-BFGS has to achieve
+ARMIJO = 1e-4  # [-] of the decrease predicted by the slope: what a step of L-BFGS has to achieve
 HALVINGS = 20
 STILL = 1e-10  # [-] relative decrease of the cost at which it ends
 
@@ -27,7 +27,7 @@ STILL = 1e-10  # [-] relative decrease of the cost at which it ends
 def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Callable:
     """Steps of an optimiser of optax on all starts at once: first_order(optax.adam(1e-2)).
 
-    As many as `fit` is given `iterations`, or else `steps`.
+    The number of steps is `iterations` of `fit`, or else `steps`.
     """
     at_least_one("steps", steps)
 
@@ -51,7 +51,7 @@ def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Ca
 def lbfgs(steps: int = 200, memory: int = 10) -> Callable:
     """L-BFGS of optax, each start on its own, with steps halved until they gain (Armijo).
 
-    At most as many as `fit` is given `iterations`, or else `steps`.
+    The number of steps is at most `iterations` of `fit`, or else `steps`.
     """
     at_least_one("steps", steps)
     scale = optax.scale_by_lbfgs(memory_size=at_least_one("memory", memory))
@@ -104,7 +104,7 @@ def _direction(scale: Any, gradient: Array, state: Any, flat: Array) -> Any:
 
 
 def _as_optax_does(fn: Callable) -> Callable:
-    """A function traced with the promotion of types and ranks that optax relies on, whatever is set."""
+    """Wrap a function so that it is traced with the promotion of types and ranks that optax relies on."""
 
     def promoting(*args: Any) -> Any:
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
@@ -114,7 +114,7 @@ def _as_optax_does(fn: Callable) -> Callable:
 
 
 def _line_search(groups, z, loss, flat: Array, direction: Array, cost: Array, gradient: Array):
-    """Per start, the first of the steps 1, 1/2, 1/4, ... that gains enough; none if none does."""
+    """Line search per start: the first of the steps 1, 1/2, 1/4, ... that gains enough; no step if none does."""
     slope = (direction * gradient).sum(1)
     downhill = slope < 0
     direction = jnp.where(downhill[:, None], direction, -gradient)
@@ -134,7 +134,7 @@ def _line_search(groups, z, loss, flat: Array, direction: Array, cost: Array, gr
 
 
 def _flat(z: Numbers) -> Array:
-    """(S, a + b R)."""
+    """Flatten z to (S, a + b R)."""
     return jnp.concatenate([z.shared, z.own.reshape(-1, z.own.shape[-1])]).T
 
 

@@ -19,8 +19,8 @@ from jax import Array
 from diffrigid.compiling import QUICK
 from diffrigid.sysid.problem import Group, linearise
 
-FAINT = 1e-2  # [-] of the largest slope: what has a smaller one is damped as if it had that
-DAMPING = (1e-9, 1e9)  # with FAINT the first holds what is seen less than 3e-7 of that: rounding, or yielding joints
+FAINT = 1e-2  # [-] of the largest slope: a number with a smaller slope is damped as if it had this one
+DAMPING = (1e-9, 1e9)  # with FAINT the first holds numbers of slopes below 3e-7 of that: rounding, or yielding joints
 STIFF = 1e7  # a damping above which a start counts as converged
 SMALL = 1e-9  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
 SETTLED = 1e-8  # decrease of the cost, relative to it, below which an accepted step was the last
@@ -30,7 +30,7 @@ UNFINISHED = "not converged after {} iterations: raise iterations, or start else
 
 
 class Numbers(NamedTuple):
-    """z of a number of starts S."""
+    """Unbounded numbers z of S starts."""
 
     shared: Array  # (a, S)
     own: Array  # (b, R, S)
@@ -40,7 +40,7 @@ class Numbers(NamedTuple):
         return _of(self, tuple(members))
 
     def sorted(self, order: Any) -> "Numbers":
-        """With the starts in another order."""
+        """Reorder the starts."""
         return _sorted(self, order)
 
 
@@ -57,7 +57,7 @@ def _sorted(z: Numbers, order: Array) -> Numbers:
 
 
 class Point(NamedTuple):
-    """Residuals and Jacobians at z, one of each for every group."""
+    """Residuals and Jacobians at z, one of each per group."""
 
     z: Numbers
     residuals: tuple[Array, ...]  # (m, R, S)
@@ -75,7 +75,7 @@ class Arrow(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Where the starts are after some iterations."""
+    """State of the starts after some iterations."""
 
     point: Point
     cost: Array  # (R, S)
@@ -96,13 +96,13 @@ def cost_of(loss: Any, residuals: tuple[Array, ...]) -> Array:
 
 
 def _costs(loss: Any, residuals: Array) -> Array:
-    """Of each record of a group, (R, S)."""
+    """Cost of each record of a group, (R, S)."""
     total = loss.rho(residuals).sum(0)
     return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
 
 def arrow(loss: Any, point: Point, members: tuple[tuple[int, ...], ...]) -> Arrow:
-    """Normal equations at a point, each residual weighted as the loss asks."""
+    """Normal equations at a point, with the residuals weighted by the loss."""
     a = point.z.shared.shape[0]
     rows, pulls = [], []
     for r, jac in zip(point.residuals, point.jacobians, strict=True):
@@ -116,7 +116,7 @@ def arrow(loss: Any, point: Point, members: tuple[tuple[int, ...], ...]) -> Arro
 
 
 def eliminate(eq: Arrow) -> tuple[Array, Array, Array]:
-    """What is left for the shared numbers, (S, a, a) and (S, a), and D^-1 (B^T | h), (S, R, b, a + 1)."""
+    """Schur complement for the shared numbers, (S, a, a) and (S, a), and D^-1 (B^T | h), (S, R, b, a + 1)."""
     if eq.h.shape[-1] == 0:
         return eq.A, eq.g, jnp.zeros((*eq.h.shape[:2], 0, eq.g.shape[-1] + 1), eq.g.dtype)
     right = jnp.concatenate([jnp.swapaxes(eq.B, -1, -2), eq.h[..., None]], axis=-1)
@@ -126,7 +126,7 @@ def eliminate(eq: Arrow) -> tuple[Array, Array, Array]:
 
 
 def solve(eq: Arrow) -> tuple[Array, Array]:
-    """The step that the normal equations ask for: of the shared numbers (S, a), and of each record's (S, R, b)."""
+    """Solve the normal equations for the step of the shared numbers (S, a), and of those of each record (S, R, b)."""
     matrix, right, solved = eliminate(eq)
     a = eq.g.shape[-1]
     shared = -jnp.linalg.solve(matrix, right[..., None])[..., 0] if a else right
@@ -135,7 +135,7 @@ def solve(eq: Arrow) -> tuple[Array, Array]:
 
 
 def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
-    """With the diagonal enlarged by damping (S, R), and shared numbers (a,) that are held left where they are."""
+    """Enlarge the diagonal by damping (S, R), and fix the shared numbers (a,) that are held."""
     free = 1.0 - held
     A = eq.A * (free[:, None] * free[None])[None] + jnp.diag(held)[None]
     B = eq.B * free[None, None, :, None]
@@ -154,9 +154,9 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
 def update(
     loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
 ) -> tuple[Progress, Numbers]:
-    """The trial where it costs less, else the old point with more damping; and what to try next.
+    """Accept the trial where it costs less, else keep the old point and raise the damping; return the next trial too.
 
-    A start is accepted or not as a whole; where nothing that is shared moves, each record for itself.
+    A start is accepted or not as a whole; where no shared number moves, each record by itself.
     """
     held = (reach.shared[:, 0] == 0).astype(progress.cost.dtype)
     alone = held.all()
@@ -181,7 +181,7 @@ def update(
 
 
 def _chosen(better: Array, whole: Array, new: Point, old: Point, members: tuple[tuple[int, ...], ...]) -> Point:
-    """New where better (R, S) by record; shared numbers where the whole start is, (S)."""
+    """Select the new point where better (R, S), by record; its shared numbers where the whole start is, (S)."""
     rows = [better[np.asarray(group)] for group in members]
     z = Numbers(_choose(whole, new.z.shared, old.z.shared), _choose(better, new.z.own, old.z.own))
     r = [_choose(ok, a, b) for ok, a, b in zip(rows, new.residuals, old.residuals, strict=True)]
@@ -196,12 +196,12 @@ def best_by_record(groups: Sequence[Group], point: Point, loss: Any) -> np.ndarr
 
 
 def _choose(better: Array, new: Array, old: Array) -> Array:
-    """By the last axes."""
+    """Select by the last axes."""
     return jnp.where(better.reshape((1,) * (new.ndim - better.ndim) + better.shape), new, old)
 
 
 def _in_order(members: tuple[tuple[int, ...], ...], parts: Sequence[Array]) -> Array:
-    """Rows of all groups in the order of the records."""
+    """Join the rows of all groups in the order of the records."""
     joined, order = jnp.concatenate(parts), np.argsort(np.concatenate([np.asarray(m) for m in members]))
     return joined if np.array_equal(order, np.arange(len(order))) else joined[order]
 
@@ -210,13 +210,13 @@ def levenberg(
     groups: Sequence[Group], z: Numbers, loss: Any, iterations: int | None, reach: Numbers,
     report: Callable[[int, np.ndarray], None],
 ) -> tuple[Point, str]:  # fmt: skip
-    """The lowest points found from the starts z, and "", or why it ended before the best of them converged.
+    """Minimise from the starts z: the lowest points, and "", or why it ended before the best of them converged.
 
-    Starts whose residuals are not finite stay where they are, at infinite cost. Ends when no start has anything to
-    gain any more.
+    Starts whose residuals are not finite stay where they are, at infinite cost. It ends when no start has anything left
+    to gain.
 
     Args:
-        reach: the longest step of each number, (a, 1) and (b, 1, 1); a shared number of which it is 0 is held.
+        reach: longest step of each number, (a, 1) and (b, 1, 1); a shared number for which it is 0 is held.
     """
     members = tuple(group.members for group in groups)
     return minimise(partial(point_at, groups), members, z, loss, iterations, reach, report)
@@ -226,7 +226,7 @@ def minimise(
     at: Callable[[Numbers], Point], members: tuple[tuple[int, ...], ...], z: Numbers, loss: Any,
     iterations: int | None, reach: Numbers, report: Callable[[int, np.ndarray], None],
 ) -> tuple[Point, str]:  # fmt: skip
-    """As `levenberg`, of any residuals: `at` gives them and their Jacobians, for groups of the records `members`."""
+    """`levenberg` for any residuals: `at` gives them and their Jacobians, for groups of the records `members`."""
     trial, iterations = at(z), ITERATIONS if iterations is None else iterations
     progress = Progress(trial, *_nothing_yet(z.own))
     try:

@@ -1,7 +1,7 @@
-"""What a residual r, in standard deviations, costs: a record with `rho(r)`, and `weight(r)` = rho'(r) / r.
+"""Losses of a residual r, in standard deviations: records with `rho(r)`, and `weight(r)` = rho'(r) / r.
 
-Least squares takes rho = r^2 / 2. The others grow slower, so that a few wrong numbers do not pull. They are minimised
-by least squares with the weights of the last point (Holland and Welsch 1977).
+Least squares has rho = r^2 / 2. The others grow more slowly, so that outliers pull less. They are minimised by least
+squares with the weights of the last point (Holland and Welsch 1977).
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Squares:
 
 @dataclass(frozen=True)
 class Huber:
-    """rho = r^2 / 2 up to `at`, straight beyond."""
+    """rho = r^2 / 2 up to `at`, linear beyond."""
 
     at: float
 
@@ -52,12 +52,12 @@ class Student:
 
 
 def squares() -> Squares:
-    """The loss of normal noise."""
+    """Loss for normal noise: least squares."""
     return Squares()
 
 
 def huber(at: float = 1.345) -> Huber:
-    """Quadratic up to `at` standard deviations, straight beyond; 1.345 has 95 % of the efficiency in normal noise.
+    """Loss quadratic up to `at` standard deviations, linear beyond; 1.345 has 95 % efficiency in normal noise.
 
     Example:
         >>> dr.huber().rho(jnp.array([1.0, 10.0])).round(3).tolist()  # squares: 0.5, 50
@@ -67,7 +67,7 @@ def huber(at: float = 1.345) -> Huber:
 
 
 def student(nu: float = 4.0) -> Student:
-    """Heavy tails: nu degrees of freedom.
+    """Loss for heavy tails: noise of Student's distribution with nu degrees of freedom.
 
     Example:
         >>> dr.student(nu=4.0).rho(jnp.array([1.0, 10.0])).round(3).tolist()  # squares: 0.5, 50

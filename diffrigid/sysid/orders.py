@@ -1,7 +1,7 @@
-"""In which order bodies strike each other at the end of each start: what it takes to have happened.
+"""Order in which bodies strike each other, in the motion at which each start ended.
 
-A different order is another explanation of the same record. Costs alone do not tell one from a search that came to an
-end too early: between two orders the cost has a kink, or a jump, that no gradient crosses.
+A different order is another explanation of the same record. Costs alone do not tell one from a search that ended too
+early: between two orders the cost has a kink, or a jump, that no gradient crosses.
 """
 
 from collections.abc import Sequence
@@ -23,9 +23,9 @@ Orders = tuple[tuple[tuple[str, ...], ...], ...]
 
 
 def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
-    """Of the first `count` starts z, of each of the first few records, the pairs that strike, in order of time.
+    """Pairs that strike, in order of time, for the first `count` starts z and each of the first few records.
 
-    At the steps of the fit: what is compiled already gives the motions.
+    Motions have the steps of the fit, so that what is compiled already gives them.
     """
     records, starts = min(LOOKED_AT[0], len(problem.runs)), min(LOOKED_AT[1], count)
     shared, own = np.asarray(z.shared, float), np.asarray(z.own, float)
@@ -51,7 +51,7 @@ def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
 
 
 def alike(orders: Orders) -> list[tuple[int, ...]]:
-    """Which starts have the same order in all records, the group of the best start first."""
+    """Groups of starts with the same order in all records, that of the best start first."""
     groups: dict[tuple[tuple[str, ...], ...], list[int]] = {}
     for start, order in enumerate(orders):
         groups.setdefault(order, []).append(start)
@@ -61,7 +61,7 @@ def alike(orders: Orders) -> list[tuple[int, ...]]:
 def in_words(orders: Orders, starts: int) -> str:
     """One line, "5 of 8 starts: cue-ball, ball-wall; 3 of 8: cue-wall"; "" where nothing strikes anything.
 
-    Of several records, the first in which the starts differ.
+    Of several records, it is about the first in which the starts differ.
     """
     groups = alike(orders)
     if not any(any(order) for order in orders):
@@ -80,7 +80,7 @@ def in_words(orders: Orders, starts: int) -> str:
 
 
 def _listed(order: Sequence[str]) -> str:
-    """Pairs, those that follow each other alike put together."""
+    """List pairs, with repeats of one pair joined."""
     runs: list[list] = []
     for pair in order:
         if runs and runs[-1][0] == pair:

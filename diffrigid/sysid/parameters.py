@@ -1,4 +1,4 @@
-"""Free parameters of a scene: where each is, and how a vector z of numbers is put into it.
+"""Free parameters of a scene: where each is, and how a vector z of numbers is written into the scene.
 
 Numbers that all records share come first in z, then those of which each record has its own.
 """
@@ -20,7 +20,7 @@ from diffrigid.world import World
 
 
 class Scene(NamedTuple):
-    """What parameters are part of."""
+    """World, state and columns: all that parameters are part of."""
 
     world: World
     state: State
@@ -39,7 +39,7 @@ class Slot:
 
     @property
     def joint(self) -> bool:
-        """True if the paths are parts of one vector, not names of one value."""
+        """Whether the paths are parts of one vector, not names of one value."""
         return isinstance(self.kind, Chart) and self.kind.name == "shares"
 
 
@@ -59,7 +59,7 @@ def write(scene: Scene, path: str, value: Array) -> Scene:
 
 
 def knows(scene: Scene, path: str) -> bool:
-    """True if the scene has such a parameter."""
+    """Whether the scene has such a parameter."""
     return path in channel_paths(scene.channels) or paths.component(path)[0] in paths.catalogue(scene.world)
 
 
@@ -71,13 +71,13 @@ def reference(slot: Slot, scene: Scene) -> Array:
 
 
 def split(slots: Sequence[Slot], z: Any) -> list[Any]:
-    """z (n, ...) in pieces, one for each slot."""
+    """Split z (n, ...) into pieces, one for each slot."""
     ends = np.cumsum([0, *(slot.size for slot in slots)])
     return [z[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
 def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
-    """The scene with the parameters for z (n,)."""
+    """Write the parameters for z (n,) into the scene."""
     used = [(slot, piece) for slot, piece in zip(slots, split(slots, z), strict=True) if slot.paths]
     values = [slot.kind.value(piece, reference(slot, scene)) for slot, piece in used]
     numbers = [
@@ -92,7 +92,7 @@ def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
 
 
 def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[Slot, ...], tuple[Slot, ...]]:
-    """The parameters that all records share, and those of which each has its own.
+    """Make slots of the parameters that all records share, and of those of which each record has its own.
 
     Raises:
         ValueError: nothing is free, a kind is none, a path is in no scene, two name the same numbers, or the value in

@@ -1,4 +1,4 @@
-"""A point of a fit, which lies on the devices, as arrays of NumPy: by record and by column, without what is missing."""
+"""A point of a fit, which is on the devices, as NumPy arrays: by record and by column, without missing values."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from diffrigid.sysid.setup import Problem
 
 
 def linear_of(problem: Problem, point: Point, best: int, loss: Any, estimated: bool) -> Linear:
-    """Residuals and slopes of one start, record by record, without the rows that are missing."""
+    """Residuals and Jacobians of one start, record by record, without missing rows."""
     rows: list[Any] = [None] * len(problem.runs)
     for group, r, jac in zip(problem.groups, point.residuals, point.jacobians, strict=True):
         values, slopes = np.asarray(r, float)[..., best], np.asarray(jac, float)[..., best]
@@ -27,7 +27,7 @@ def linear_of(problem: Problem, point: Point, best: int, loss: Any, estimated: b
 
 
 def _as_least_squares(loss: Any, residuals: tuple[np.ndarray, ...], numbers: int) -> tuple[Any, float]:
-    """Residuals that least squares would follow as the loss follows these, and their variance."""
+    """Pseudo-residuals with which least squares acts as the loss with these residuals, and their variance."""
     if isinstance(loss, Squares):
         return residuals, 1.0
     joined = jnp.asarray(np.concatenate(residuals))
@@ -39,7 +39,7 @@ def _as_least_squares(loss: Any, residuals: tuple[np.ndarray, ...], numbers: int
 
 
 def row_mask(problem: Problem, group: Group, k: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which rows of record k of a group are measured (or of a prior), and their times (m,)."""
+    """Whether rows of record k of a group are measured (or those of a prior), and their times (m,)."""
     use, times = [], []
     for name, weights in group.data.weights.items():
         w = np.asarray(weights)[..., k if weights.shape[-1] > 1 else 0]

@@ -3,8 +3,8 @@
     z -> parameters -> scene of every record -> states -> what each column reads -> weighted residuals
 
 Records of one structure are one group: they are padded to one length and lie, like the starts and the directions of the
-Jacobian, side by side on the last axis, so that what is compiled does not grow with their number. All measured numbers
-are arguments of what is compiled: another record of the same shape costs no compilation.
+Jacobian, side by side on the last axis, so that the program does not grow with their number. All measured numbers are
+arguments of the program: another record of the same shape costs no compilation.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,21 +28,21 @@ from diffrigid.sysid.records import Run, Series
 from diffrigid.sysid.sensors import Part, difference, is_angle
 from diffrigid.sysid.times import controls_over, grid
 
-LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are looked at
-LITTLE = 10_000_000  # of work in all records, starts and directions, up to which a fit compiles for longer than it runs
+LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are returned
+LITTLE = 10_000_000  # work in all records, starts and directions, up to which a fit compiles for longer than it runs
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is compiled for a group of records."""
+    """Static description of a group of records, which is compiled in."""
 
     slots: tuple[Slot, ...]  # shared ones first; those that no scene of the group has are without paths
-    clocked: tuple[str, ...]  # columns whose times are shifted
+    clocked: tuple[str, ...]  # columns with times that are shifted
     priors: tuple[float, ...]  # of each slot: 1 / sqrt(records that share it)
 
 
 class Data(NamedTuple):
-    """The records of a group in arrays, with a last axis of R records, or of 1 where they are alike."""
+    """Records of a group in arrays, with a last axis of R records, or of 1 where they are equal."""
 
     scene: Scene
     lengths: Any  # (S, R) [s] of the steps
@@ -56,7 +56,7 @@ class Data(NamedTuple):
 
 @dataclass(frozen=True)
 class Group:
-    """Records that are simulated together, and which they are."""
+    """Records that are simulated together, and their indices."""
 
     plan: Plan
     data: Data
@@ -67,7 +67,7 @@ class Group:
 
 
 def make_groups(found: Sequence[Run], slots: Sequence[Slot], shared: int, longest: float) -> list[Group]:
-    """Records of one structure together.
+    """Group the records by structure.
 
     Args:
         shared: how many of the slots belong to all records.
@@ -117,7 +117,7 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
 
 
 def _absent(slot: Slot) -> Slot:
-    """The place of a parameter in z, for scenes that do not have it."""
+    """Placeholder of a parameter in z, for scenes that do not have it."""
     return Slot(slot.name, (), slot.kind, slot.size)
 
 
@@ -126,7 +126,7 @@ def _series(run: Run, name: str) -> Series:
 
 
 def known(run: Run, name: str) -> np.ndarray:
-    """Which residuals of a column are measured, (K, size of the residual) bool."""
+    """Whether residuals of a column are measured, (K, size of the residual) bool."""
     finite = np.isfinite(_series(run, name).values)
     observer = run.channels[name].observer
     if not (isinstance(observer, Part) and observer.field == "q"):
@@ -135,7 +135,7 @@ def known(run: Run, name: str) -> np.ndarray:
 
 
 def full_turn(run: Run, name: str) -> float:
-    """What a column of angles reads after a full turn more; 0 for other columns."""
+    """Change of the reading of a column of angles by a full turn; 0 for other columns."""
     channel = run.channels[name]
     return 2.0 * np.pi * abs(float(channel.scale)) if is_angle(channel) else 0.0
 
@@ -145,7 +145,7 @@ def _padded(array: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _side_by_side(leaves: Sequence[Any]) -> np.ndarray:
-    """Arrays along a new last axis, of length 1 if all are equal."""
+    """Stack arrays along a new last axis, of length 1 if all are equal."""
     leaves = [np.asarray(leaf) for leaf in leaves]
     alike = all(leaf is leaves[0] or np.array_equal(leaf, leaves[0]) for leaf in leaves)
     return np.stack(leaves[:1] if alike else leaves, axis=-1)
@@ -155,7 +155,7 @@ def _side_by_side(leaves: Sequence[Any]) -> np.ndarray:
 
 
 def residuals(plan: Plan, z: Array, data: Data) -> Array:
-    """Weighted residuals (m, B) of B lanes z (n, B), among the devices; arrays of `data` have a last axis of 1 or B.
+    """Weighted residuals (m, B) of B lanes z (n, B), over all devices; arrays of `data` have a last axis of 1 or B.
 
     Rows of priors come last, shared among the records so that their squares sum to one prior.
     """
@@ -163,7 +163,7 @@ def residuals(plan: Plan, z: Array, data: Data) -> Array:
 
 
 def _simulated(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
-    """Residuals, and the states (S+1, ..., B) that they come from, which lie where they were computed."""
+    """Residuals, and the states (S+1, ..., B) that they come from, which stay where they were computed."""
     if len(devices()) == 1:
         return _simulated_here(plan, z, data)
     lanes, (leaves, tree) = z.shape[1], jax.tree.flatten((z, data))
@@ -200,14 +200,14 @@ def _simulated_here(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
 
 
 def _lanes(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
-    """The scene of every lane."""
+    """Scenes of all lanes, with their parameters written in."""
     batched = jax.tree.map(lambda leaf: -1 if leaf.shape[-1] > 1 else None, scene)
     scene = jax.tree.map(lambda leaf: leaf if leaf.shape[-1] > 1 else leaf[..., 0], scene)
     return jax.vmap(lambda scene, z: put(slots, scene, z), in_axes=(batched, -1), out_axes=-1)(scene, z)
 
 
 def _pick(leaf: Array, index: Array) -> Array:
-    """Rows of states (S+1, ..., B) by index (K, 1) or (K, B)."""
+    """Pick rows of states (S+1, ..., B) by index (K, 1) or (K, B)."""
     if index.shape[1] == 1:
         return leaf[index[:, 0]]
     return jnp.take_along_axis(leaf, index.reshape(len(index), *[1] * (leaf.ndim - 2), -1), axis=0)
@@ -231,7 +231,7 @@ def linearised(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
     At z (n, R, S), R records and S starts, by forward mode. Motions are states (steps + 1, ..., R, S).
 
     The n directions are lanes of the last axis too, each with its own copy of the state: slightly slower to run than
-    one shared state, and twice as fast to trace.
+    one shared state, but much faster to trace.
     """
     n, R, S = z.shape
     wide = jnp.broadcast_to(z[:, None], (n, n, R, S)).reshape(n, -1)
@@ -250,7 +250,7 @@ def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
 
 
 def _compiled(fn: Callable) -> tuple[Callable, ...]:
-    """`fn` compiled as soon as can be, and to run sooner."""
+    """Two versions of `fn`: compiled as soon as possible, and compiled to run fast."""
     return tuple(
         uncollected(jax.jit(fn, static_argnames="plan", compiler_options=options)) for options in (QUICK, LASTING)
     )
@@ -260,7 +260,7 @@ LINEARISE, EVALUATE = map(_compiled, (linearised, residuals_of))
 
 
 def linearise(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
-    """`linearised`, compiled as suits the work that it is."""
+    """`linearised`, compiled as suits its amount of work."""
     return LINEARISE[_is_much(z, data)](plan, z, data)
 
 
@@ -270,12 +270,12 @@ def evaluate(plan: Plan, z: Array, data: Data) -> Array:
 
 
 def _is_much(z: Array, data: Data) -> bool:
-    """Whether to simulate it in the directions of all numbers z takes longer than to compile, or is for a GPU."""
+    """Whether the simulation in the directions of all z takes longer than its compilation, or is for a GPU."""
     return jax.default_backend() != "cpu" or z.size * len(data.lengths) * work(data.scene.world) > LITTLE
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:
-    """Arrays of R records for the lanes (copies, R, starts); those with one for all stay as they are."""
+    """Spread arrays of R records over the lanes (copies, R, starts); those that all records share stay as they are."""
 
     def spread(leaf: Array) -> Array:
         if leaf.ndim == 0 or leaf.shape[-1] == 1:

@@ -1,4 +1,4 @@
-"""Profile likelihood: the best cost when one number is held, and the interval that follows from it."""
+"""Profile likelihood: the lowest cost when one number is held, and the interval that follows from it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,15 +15,15 @@ from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import reach_of
 from diffrigid.sysid.summary import Parameter
 
-WIDE = 1.6  # of the half width of the interval from the Jacobian: how far the profile goes on either side
-FURTHER = 3  # times it then goes twice as far, where the cost has not risen to the level
-REFINED = 2  # times that the level is bracketed again after such steps
-FAR = 15.0  # z of a bounded number that is at its bound to single precision
+WIDE = 1.6  # [-] of the half width of the interval from the Jacobian: extent of the profile on either side
+FURTHER = 3  # how often that is then doubled, where the cost has not risen to the level
+REFINED = 2  # how often the level is bracketed again after such steps
+FAR = 15.0  # z at which a bounded number is at its bound to single precision
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Of one number: values, and by how much the cost rises when all others are fitted to each."""
+    """Profile of one number: values, and the rise of the cost when all other numbers are fitted to each."""
 
     name: str
     values: np.ndarray  # (P,) increasing
@@ -35,7 +35,7 @@ class Profile:
 
     @property
     def note(self) -> str:
-        """What to say in a table."""
+        """Note for a table."""
         return f"profile, open {' and '.join(self.open)}" if self.open else "profile"
 
     def __repr__(self) -> str:
@@ -77,7 +77,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> Profile:
 
 
 def with_profiles(fit: Fit, profiles: Sequence[Profile]) -> Fit:
-    """The fit with the intervals of profiles in its table, and a word on those that are open."""
+    """The fit with the intervals of profiles in its table, and a note on those that are open."""
     found = {p.name: p for p in profiles}
 
     def changed(p: Parameter) -> Parameter:
@@ -92,10 +92,10 @@ def with_profiles(fit: Fit, profiles: Sequence[Profile]) -> Fit:
 def _extended(
     fit: Fit, index: int, z: np.ndarray, level: float, count: int, most: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """z and the rise of the cost there, with `count` more points at a time outwards until it reaches the level.
+    """z and the rise of the cost there, extended outwards by `count` points at a time until it reaches the level.
 
     Args:
-        most: size of z beyond which it does not go.
+        most: largest |z| of the points.
     """
     middle, rise, share = z[len(z) // 2], _rises(fit, index, z), np.arange(1, count + 1) / count
 
@@ -133,7 +133,7 @@ def _index(fit: Fit, name: str) -> int:
 
 
 def _costs(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
-    """Lowest cost for each held value, as many at once as the fit had starts, so that nothing is compiled again."""
+    """Lowest cost for each held value, as many at once as the fit had starts, so that nothing is recompiled."""
     count = fit.starts.shape[1]
     dtype = fit.problem.runs[0].state.x.dtype
     reach, out = reach_of(fit.problem, [index]), []
@@ -148,7 +148,7 @@ def _costs(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
 
 
 def _crossing(away: np.ndarray, rise: np.ndarray, level: float, side: int) -> float:
-    """Where the rise reaches the level on one side of zero, NaN if nowhere; sqrt(rise) is nearly straight."""
+    """Point at which the rise reaches the level on one side of zero, NaN if nowhere; sqrt(rise) is nearly linear."""
     use = side * away >= 0
     away, rise = away[use][::side], np.sqrt(rise[use][::side])
     above = np.flatnonzero(rise > np.sqrt(level))

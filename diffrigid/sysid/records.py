@@ -15,8 +15,8 @@ from diffrigid.state import State
 from diffrigid.sysid.sensors import Channel, Part, channel_of
 from diffrigid.world import World, check
 
-SAME = 1e-9  # [s] times of different columns that are this close are one
-UNLIKE = 20.0  # [-] speeds that differ by more than this factor from those of the positions are in another unit
+SAME = 1e-9  # [s] times of different columns that are this close are the same
+UNLIKE = 20.0  # [-] speeds that differ by more than this factor from those of the positions have another unit
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Run:
 
 
 def runs(world: World, state: State, observations: Any, observe: Mapping[str, Any], noise: Mapping | None) -> list[Run]:
-    """All records of a fit.
+    """Read and check all records of a fit.
 
     Args:
         observations: of one record, or a list of such and of Records.
@@ -115,7 +115,7 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
 
 
 def same_data(one: Run, other: Run) -> bool:
-    """True if two records hold the same columns, times and values."""
+    """Whether two records hold the same columns, times and values."""
     pairs = {s.name: s for s in one.series}, {s.name: s for s in other.series}
     return pairs[0].keys() == pairs[1].keys() and all(
         np.array_equal(s.t, pairs[1][name].t) and np.array_equal(s.values, pairs[1][name].values, equal_nan=True)
@@ -126,7 +126,7 @@ def same_data(one: Run, other: Run) -> bool:
 def columns(
     world: World, observations: Any, observe: Mapping[str, Any], where: str = "observations"
 ) -> tuple[tuple[Series, ...], dict[str, Channel], tuple[Series, ...]]:
-    """Columns of a record, what each observes, and the controls among them, which have the names that forces give.
+    """Columns of a record, what each observes, and the controls among them, which have the names given by forces.
 
     Args:
         observations: a mapping or a table (anything with `columns`), or the path of a CSV file. "t" (K,) [s], and by
@@ -168,7 +168,7 @@ def columns(
 
 
 def read_csv(path: str | Path) -> dict[str, np.ndarray]:
-    """Columns of a file with one line of names; an empty cell is missing.
+    """Read the columns of a file with one line of names; an empty cell is a missing value.
 
     Between columns are commas, or semicolons or tabs where the names have these; numbers may then have decimal commas.
     """
@@ -219,7 +219,7 @@ def _times(t: Any, where: str) -> np.ndarray:
 
 
 def _floats(values: Any, where: str) -> np.ndarray:
-    """A column as floats; masked values of a table are missing."""
+    """Convert a column to floats; masked values of a table are missing."""
     try:
         array: np.ndarray = np.asarray(np.ma.filled(np.ma.asarray(values, float), np.nan))
     except (TypeError, ValueError, OverflowError):
@@ -230,13 +230,13 @@ def _floats(values: Any, where: str) -> np.ndarray:
 
 
 def check_mapping(where: str, value: Any) -> None:
-    """Raise ValueError for what is neither a dict by column nor None."""
+    """Raise ValueError unless a value is a dict by column, or None."""
     if value is not None and not isinstance(value, Mapping):
         raise ValueError(f"{where} is {value!r:.80}: expected a dict by name of column")
 
 
 def _gather(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Components "ball.x[0]", "ball.x[1]" put together under "ball.x", as {component: values}."""
+    """Collect components "ball.x[0]", "ball.x[1]" under "ball.x", as {component: values}."""
     out: dict[str, Any] = {}
     for name, values in table.items():
         if isinstance(values, Mapping):
@@ -255,7 +255,7 @@ def _gather(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _filled(values: Any, rows: int, size: int, where: str, world: World) -> np.ndarray:
-    """(K, size), from an array or from some of its components."""
+    """Fill a column (K, size) from an array or from some of its components."""
     if isinstance(values, dict):
         if bad := [index for index in values if index >= size]:
             raise ValueError(f"{where}: component [{bad[0]}] of {size} in this {world.dim}D world")
@@ -288,7 +288,7 @@ def _refuse_empty_columns(found: list[Run]) -> None:
 
 
 def _refuse_units(found: list[Series], channels: Mapping[str, Channel], where: str) -> None:
-    """Velocities that are far from the slopes of the positions of the same body were given in another unit."""
+    """Raise ValueError for velocities far from the slopes of the body's positions: they have another unit."""
     parts = {(c.observer.body, c.observer.field): name for name, c in channels.items() if isinstance(c.observer, Part)}
     by_name = {s.name: s for s in found}
     for (body, field), name in parts.items():
@@ -305,7 +305,7 @@ def _refuse_units(found: list[Series], channels: Mapping[str, Channel], where: s
 
 
 def _slopes(series: Series, lag: int) -> np.ndarray:
-    """Between values that are `lag` rows apart, (K - lag, size)."""
+    """Difference quotients of values that are `lag` rows apart, (K - lag, size)."""
     return (series.values[lag:] - series.values[:-lag]) / (series.t[lag:] - series.t[:-lag])[:, None]
 
 
@@ -319,7 +319,7 @@ def noise_guess(values: np.ndarray, turn: float) -> float:
     """Standard deviation of the noise of a column (K, size) from second differences, which smooth motion hardly has.
 
     Args:
-        turn: after which values are the same again; 0: never.
+        turn: period after which values are the same again; 0: none.
     """
     first = np.diff(values, axis=0)
     first = first - turn * np.round(first / turn) if turn else first

@@ -1,4 +1,4 @@
-"""What a fit says of its result as a whole, before it says how sure its numbers are."""
+"""Remarks of a fit on its result as a whole, apart from the uncertainty of its numbers."""
 
 from collections.abc import Sequence
 
@@ -17,10 +17,10 @@ from diffrigid.sysid.records import Run
 from diffrigid.sysid.setup import Problem
 from diffrigid.world import World
 
-AS_LARGE = 0.5  # [-] of the spread of a column: residuals from which on, if they follow each other, nothing is fitted
-ANYWHERE = 0.25  # [-] of a turn: angles that are anywhere have residuals of 1 / sqrt(12) of one
-OTHER = 1.1  # times the mass that a solid body had, from which on the inertia that it keeps is doubted
-TORN = 1e-3  # [m or rad] by which a joint may be off at the fitted start
+AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are autocorrelated, mean that there is no fit
+ANYWHERE = 0.25  # [-] of a turn: residuals of uniformly random angles are 1 / sqrt(12) of a turn
+OTHER = 1.1  # [-] change of the mass of a solid body, from which on an unchanged inertia is doubted
+TORN = 1e-3  # [m or rad] largest error of a joint at the fitted start without a remark
 
 
 def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[dict[str, np.ndarray]]) -> list[str]:
@@ -49,7 +49,7 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
 
 
 def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray) -> bool:
-    """Whether residuals are as large as what was seen varies, and are not noise."""
+    """Whether residuals are as large as the variation of the measured values, and are not noise."""
     residuals, values = (part[:, np.isfinite(part).any(0)] for part in (residuals, values))
     if turn := full_turn(run, name):
         values = np.unwrap(values[np.isfinite(values).all(1)], axis=0, period=turn)
@@ -61,7 +61,7 @@ def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray) -> 
 
 
 def _torn(scene: Scene) -> list[str]:
-    """Joints that the bodies at the fitted start are off, which the first step puts right at once."""
+    """Remarks on joints that the fitted start violates, which the first step corrects at once."""
     world, state = scene.world, scene.state
     if not world.joints:
         return []
@@ -80,7 +80,7 @@ def _torn(scene: Scene) -> list[str]:
 
 
 def _light_inertia(problem: Problem, scene: Scene) -> list[str]:
-    """Solid bodies that have another mass now, and the inertia that they had."""
+    """Remarks on solid bodies whose mass has changed in the fit, but not their inertia."""
     before, after = problem.runs[0], scene.world
     paths = {path for slot in (*problem.shared, *problem.own) for path in slot.paths}
     out = []
@@ -102,7 +102,7 @@ def _light_inertia(problem: Problem, scene: Scene) -> list[str]:
 
 
 def _is_turned(world: World, body: int) -> bool:
-    """Whether anything can turn a body: friction, joints, forces that act on it beside its centre, or its shape."""
+    """Whether anything can turn a body: friction, joints, torques of forces, or a shape that is not round."""
     (shape,) = (shape for shape, owners in zip(world.shapes, world.owners, strict=True) if body in owners)
     rubs = bool((np.asarray(world.bodies.friction) > 0).any() or (np.asarray(world.statics.friction) > 0).any())
     return rubs or bool(world.joints) or has_torque(world) or not isinstance(shape, Disc | Sphere)

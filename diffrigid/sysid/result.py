@@ -1,4 +1,4 @@
-"""The result of a fit: numbers with intervals, what is known of them, and what can be asked of it."""
+"""The result of a fit: numbers with intervals, notes on them, and functions of the result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -44,9 +44,9 @@ from diffrigid.sysid.times import all_times, motion
 from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
 
-SCORED = 30  # iterations for the numbers of a record that was held out
-UNSEEN = 1e-6  # [-] of a slope along what is not seen: more is not rounding
-CLOSE = 0.95  # [-] a correlation from which two parameters are reported to move together
+SCORED = 30  # iterations for the own numbers of a record that was held out
+UNSEEN = 1e-6  # [-] part of a slope along undetermined directions: more is not rounding
+CLOSE = 0.95  # [-] correlation from which on two parameters are reported to go together
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Fit:
 
     summary: Summary
     problem: Problem
-    scenes: tuple[Scene, ...]  # of every record, with the parameters put in
+    scenes: tuple[Scene, ...]  # of every record, with the parameters written in
     shared: np.ndarray  # (a,) z of the shared numbers
     own: np.ndarray  # (b, R) z of those of each record
     linear: Linear
@@ -90,7 +90,7 @@ class Fit:
 
     @property
     def orders(self) -> Orders:
-        """Of each start, the best first, and of each of the first three records, the pairs that strike, in order."""
+        """Pairs that strike, in order, for each start, the best first, and for each of the first three records."""
         return self.summary.orders
 
     @property
@@ -99,27 +99,27 @@ class Fit:
 
     @property
     def world(self) -> World:
-        """Of the first record."""
+        """Fitted world of the first record."""
         return self.scenes[0].world
 
     @property
     def state(self) -> State:
-        """Initial state of the first record."""
+        """Fitted initial state of the first record."""
         return self.scenes[0].state
 
     @property
     def t(self) -> np.ndarray:
-        """(T+1,) [s] times of the first record, from its start on."""
+        """Times (T+1,) [s] of the first record, from its start on."""
         return all_times(self.problem.runs[0])
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of the shared unbounded numbers z, (a, a)."""
+        """Covariance of the shared unbounded numbers z, (a, a)."""
         return self.uncertainty.covariance
 
     @property
     def correlation(self) -> np.ndarray:
-        """Of the shared numbers, (a, a)."""
+        """Correlations of the shared numbers, (a, a)."""
         return correlations(self.uncertainty.covariance)
 
     @cached_property
@@ -149,8 +149,8 @@ class Fit:
     def score(self, observations: Any, starts: int = 1, seed: int = 0) -> dict[str, float]:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
 
-        Numbers that every record has for itself are found anew, from several starts if asked for, the first from its
-        state, by default that of the first record of the fit; of a record that was fitted, from what was found.
+        Numbers that each record has for itself are fitted anew, from several starts if asked for, the first from its
+        state, by default that of the first record of the fit; for a record that was fitted, from the values found.
         """
         free, observe = self.problem.free, self.problem.observe
         scored = runs(self.world, self.state, observations, observe, None)
@@ -212,7 +212,7 @@ def describe(
     problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
     residuals: tuple[dict[str, np.ndarray], ...], loss: Any,
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
-    """The parameters with intervals, and the notes under the table."""
+    """Parameters with intervals, and the notes under the table."""
     places = coordinates((*problem.shared, *problem.own), references(problem))
     blind = blind_directions(linear, places)
     quantile = student_quantile(uncertainty.freedom)
@@ -249,7 +249,7 @@ def number_names(problem: Problem) -> list[str]:
 
 
 def pieces(slots: tuple[Slot, ...], first: int = 0) -> list[tuple[Slot, slice]]:
-    """The numbers of z of each parameter, from `first` on."""
+    """Slices of z that belong to each parameter, from `first` on."""
     ends = np.cumsum([first, *(slot.size for slot in slots)])
     return [(slot, slice(*pair)) for slot, *pair in zip(slots, ends[:-1], ends[1:], strict=True)]
 
@@ -284,7 +284,7 @@ def _note(slot: Slot, value: np.ndarray, blind: Sequence[Blind]) -> str:
 
 
 def unseen_of(blind: Sequence[Blind], rows: slice) -> np.ndarray:
-    """What the directions that are not seen change of some numbers of z, orthonormal, (n, k)."""
+    """Orthonormal basis (n, k), n directions, of the undetermined changes of k numbers of z."""
     parts = np.stack([np.zeros(rows.stop - rows.start), *(b.direction[rows] for b in blind)])
     parts = parts / np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), 1e-300)
     _, sizes, basis = np.linalg.svd(parts, full_matrices=False)
@@ -294,14 +294,14 @@ def unseen_of(blind: Sequence[Blind], rows: slice) -> np.ndarray:
 def interval_of(
     slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, quantile: float, unseen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Value, low and high end: through the map of z where it acts number by number, else to first order.
+    """Value, and low and high end of its interval: by the map of z where it acts number by number, else to first order.
 
-    Infinite where a value changes along `unseen` (n, k): what remains of it without these has an interval.
+    Infinite where a value changes along `unseen` (n, k); changes without these have an interval.
     """
     if isinstance(slot.kind, Free):
         deviation = np.where(np.abs(unseen).max(0, initial=0.0) > UNSEEN, np.inf, np.sqrt(np.diag(covariance)))
         ends = (z, z - quantile * deviation, z + quantile * deviation)
-        with np.errstate(over="ignore"):  # of what is hardly seen
+        with np.errstate(over="ignore"):  # of numbers that are hardly determined
             value, low, high = (np.asarray(slot.kind.value(end, about), float) for end in ends)
         return value, low, high
     centre = jnp.asarray(z, jnp.result_type(about))
@@ -316,7 +316,7 @@ def interval_of(
 
 
 def unit_of(problem: Problem, slot: Slot) -> str:
-    """SI unit; that of a column is the user's, unless the column is a quantity by its name, and not scaled."""
+    """SI unit of a parameter; for a column the user's, unless its name is that of a quantity, and it is not scaled."""
     path, scene = slot.paths[0], scene_having(problem, slot)
     column, _, field = component(path)[0].rpartition(".")
     if field == "bias" and np.all(np.asarray(scene.channels[column].scale) == 1):
@@ -325,7 +325,7 @@ def unit_of(problem: Problem, slot: Slot) -> str:
 
 
 def _together(covariance: np.ndarray, places, blind) -> list[str]:
-    """Pairs of shared numbers whose errors go together, beyond those that are not determined at all."""
+    """Notes on pairs of shared numbers whose errors are correlated, except those not determined at all."""
     rho, out = correlations(covariance), []
     bad = {name for b in blind for name in b.names}
     for i, first in enumerate(places):

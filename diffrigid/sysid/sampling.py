@@ -1,8 +1,8 @@
-"""Draws from the posterior of a fit, by NUTS of blackjax: intervals where the problem is far from a linear one.
+"""Draws from the posterior of a fit, by NUTS of blackjax: intervals where the problem is far from linear.
 
     log density of z  =  - sum of the loss of all residuals, those of priors among them  +  log |d value / d z|
 
-With the last term a density that is flat is flat in the parameters (in the volume that their values span: angles of a
+With the last term a flat density is flat in the parameters (in the volume that their values span: angles of a
 direction, entries of an inertia), not in z. Noise that was estimated is held at what the fit found.
 
 Source: Hoffman and Gelman, The No-U-Turn Sampler, 2014.
@@ -31,9 +31,9 @@ from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import rows_of
 from diffrigid.tables import lined_up
 
-ACCEPTED = 0.8  # [-] share of proposals that the length of the steps is tuned to
-SETTLED = 1.01  # R-hat above which chains have not found the same
-UNLIKE = 1.25  # ratio of widths from which an interval is not that of the fit
+ACCEPTED = 0.8  # [-] share of accepted proposals to which the length of the steps is tuned
+SETTLED = 1.01  # R-hat above which chains do not agree
+UNLIKE = 1.25  # ratio of widths from which an interval differs from that of the fit
 HEADER = ("parameter", "mean", "95 % interval", "of the fit", "unit", "R-hat", "draws worth")
 
 
@@ -44,7 +44,7 @@ class Posterior:
     draws: dict[str, np.ndarray]  # by name, (chains, draws, ...); of parameters that each record has (..., R, ...)
     parameters: tuple[Parameter, ...]  # mean, and the 2.5 and 97.5 % quantiles
     r_hat: dict[str, float]  # by name, the largest of its numbers: spread of all chains over that of each
-    size: dict[str, float]  # by name, the least of its numbers: how many independent draws they are worth
+    size: dict[str, float]  # by name, the least of its numbers: effective number of independent draws
     fit: Fit
     notes: tuple[str, ...]
 
@@ -61,7 +61,7 @@ class Posterior:
 
 
 def sample(fit: Fit, draws: int = 1000, *, chains: int = 4, warmup: int = 300, seed: int = 0) -> Posterior:
-    """Draws from the posterior of a fit; needs `pip install "diffrigid[sampling]"`.
+    """Draw from the posterior of a fit; needs `pip install "diffrigid[sampling]"`.
 
     Priors are those of `free`, elsewhere flat in the parameter, within its bounds; the likelihood is exp(-loss). Chains
     begin about the fitted values, side by side, in the metric of their covariance. They explore one order of impacts,
@@ -118,7 +118,7 @@ def _of_records(problem: Problem, slot: Slot) -> Array:
 
 
 def _covariance(fit: Fit) -> np.ndarray:
-    """Of all z, (n, n), also where nothing is known: as if each was known to within a large change."""
+    """Covariance of all z, (n, n), finite also where the data tell nothing: a large change of each is a prior."""
     linear, problem = fit.linear, fit.problem
     (a, b), records = problem.sizes, len(problem.runs)
     places = coordinates((*problem.shared, *problem.own), references(problem))
@@ -177,14 +177,14 @@ def _log_volume(slots: Sequence[Slot], z: Array, refer: Sequence[Array]) -> Arra
 
 
 def _side_by_side(parts: Sequence[tuple[Plan, tuple[int, ...]]], loss: Any, a: int, b: int) -> Any:
-    """Cost of one z (n,), with its gradient by forward mode, of which `vmap` makes lanes on the last axis.
+    """Make the cost of one z (n,), with its gradient by forward mode; `vmap` makes lanes on the last axis of it.
 
-    Inside, a batch lies last, and steps on one that lies in front are slower.
+    Inside, the batch axis is last: steps on a leading batch axis are slower.
     """
 
     @jax.jit  # traced once, however often the loops around it are
     def lanes(z: Array, data: tuple[Data, ...]) -> tuple[Array, Array]:
-        """Of z (n, S): cost (S,), gradient (n, S)."""
+        """Cost (S,) and gradient (n, S) at z (n, S)."""
         members = tuple(members for _, members in parts)
         own = jnp.swapaxes(z[a:].reshape(sum(map(len, members)), b, z.shape[1]), 0, 1)
         numbers = Numbers(z[:a], own)
@@ -231,7 +231,7 @@ def _posterior(fit: Fit, values: dict[str, np.ndarray], divergent: int) -> Poste
 
 
 def _values(slots: Sequence[Slot], z: Array, refer: Sequence[Array]) -> dict[str, np.ndarray]:
-    """Parameters (chains, draws, ...) of z (chains, draws, n), or of each record, (chains, draws, R, n)."""
+    """Parameters (chains, draws, ...) for z (chains, draws, n); those of each record for z (chains, draws, R, n)."""
     out = {}
     for slot, piece, about in zip(slots, split(slots, jnp.moveaxis(z, -1, 0)), refer, strict=True):
         value: Any = jax.vmap(jax.vmap(slot.kind.value, (0, None)), (0, None))
@@ -241,17 +241,17 @@ def _values(slots: Sequence[Slot], z: Array, refer: Sequence[Array]) -> dict[str
 
 
 def _quality(value: np.ndarray) -> tuple[float, float]:
-    """The largest R-hat and the least effective size of the numbers of a parameter, (chains, draws, ...)."""
+    """Largest R-hat and least effective size of the numbers of a parameter, (chains, draws, ...)."""
     columns = value.reshape(*value.shape[:2], -1)
     found = [agreement(columns[..., k]) for k in range(columns.shape[2])]
     return max(r_hat for r_hat, _ in found), min(size for _, size in found)
 
 
 def agreement(draws: np.ndarray) -> tuple[float, float]:
-    """R-hat, and how many independent draws these (chains, draws) are worth; each chain is cut in two.
+    """R-hat, and the effective number of independent draws, of draws (chains, draws); each chain is cut in two.
 
-    R-hat is the standard deviation of all over that within the halves: 1 if they have found the same. The size is
-    their number over 1 + 2 (sum of the autocorrelations), as long as two of these that follow each other are positive.
+    R-hat is the standard deviation of all over that within the halves: 1 if they agree. The size is the number of draws
+    over 1 + 2 (sum of the autocorrelations), as long as the sum of two successive ones is positive.
     Source: Gelman et al., Bayesian Data Analysis, 2013, sections 11.4 and 11.5; Geyer 1992.
     """
     half = draws.shape[1] // 2
@@ -270,7 +270,7 @@ def agreement(draws: np.ndarray) -> tuple[float, float]:
 
 
 def _compared(drawn: Parameter, fitted: Parameter) -> str:
-    """Where the interval of the fit is too narrow or too wide."""
+    """Note if the interval of the fit is too narrow or too wide, else ""."""
     ratio = (drawn.high - drawn.low) / np.maximum(fitted.high - fitted.low, 1e-300)
     worst = float(ratio.flat[np.abs(np.log(np.maximum(ratio, 1e-300))).argmax()])
     if 1 / UNLIKE < worst < UNLIKE:

@@ -1,8 +1,8 @@
 """Multiple shooting: a long record cut into short ones, each with an initial state of its own.
 
-Over a short time the motion depends on its start as a straight line does; over many impacts it does not, and a fit from
-a poor start is lost. What all pieces share is found first, with `each` for their states; then a fit of the whole record
-with growing `windows` starts from there, and ends in one motion without jumps. `fit_in_pieces` does both, or by hand:
+Over a short time the motion depends almost linearly on its start; over many impacts it does not, and a fit from a poor
+start fails. What all pieces share is found first, with `each` for their states; then a fit of the whole record with
+growing `windows` starts from there, and ends in one motion without jumps. `fit_in_pieces` does both, or by hand:
 
     pieces = segments(world, state, observations, 8)
     own = {"ball.x": each(real()), "ball.v": each(real())}
@@ -32,12 +32,12 @@ from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.times import motion
 from diffrigid.world import World, check
 
-FRAMES = 5  # rows of a column that a guess of its start is made from
-LOST = 1.5  # times the noise in pieces: residuals of the whole record beyond which it is said to be lost
+FRAMES = 5  # rows of a column from which its start is guessed
+LOST = 1.5  # [-] times the noise in pieces: residuals of the whole record beyond which it is reported as lost
 
 
 def segments(world: World, state: State, observations: Any, count: int) -> list[Record]:
-    """Pieces of equal duration, with initial states guessed from the first rows of their "x" and "angle" columns.
+    """Cut a record into pieces of equal duration, with initial states guessed from the first rows of "x" and "angle".
 
     Example:
         >>> [piece.start for piece in dr.segments(world, state, measured, 3)]
@@ -65,7 +65,7 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
 
 
 def _guessed(world: World, state: State, series: Series, start: float) -> State:
-    """The state with position and velocity of one column's body from a straight line through its next rows."""
+    """Set position and velocity of one column's body in the state, by a straight line through its next rows."""
     body, _, field = series.name.rpartition(".")
     names = {"x": ("x", "v"), "angle": ("angle", "w")}
     if field not in names:
@@ -115,7 +115,7 @@ def fit_in_pieces(
 
 
 def jumps(fit: Fit) -> dict[str, np.ndarray]:
-    """How far the next piece begins from where each ends.
+    """Jumps from the end of each piece to the beginning of the next.
 
     Args:
         fit: of the pieces that `segments` made.
@@ -138,14 +138,14 @@ def jumps(fit: Fit) -> dict[str, np.ndarray]:
 
 
 def _initial(world: World, key: Any) -> bool:
-    """True for a path, or a tuple of paths, into the initial state."""
+    """Whether a path, or a tuple of paths, is part of the initial state."""
     names = [key] if isinstance(key, str) else key
     known = paths.catalogue(world)
     return any(place.chain[0] == 1 for name in names for place in known.get(name, []))
 
 
 def _own_states(world: World, observations: Any) -> dict[str, Each]:
-    """What each piece has of its own: pose and velocity of what is measured.
+    """Free parameters that each piece has of its own: pose and velocity of the measured bodies.
 
     Raises:
         ValueError: a body whose position is no column.
@@ -163,7 +163,7 @@ def _own_states(world: World, observations: Any) -> dict[str, Each]:
 
 
 def _apart(first: Fit, count: int) -> str:
-    """The largest jumps in words."""
+    """Note on the largest jumps."""
     found = jumps(first)
     largest = []
     for field, unit in (("x", "m"), ("v", "m/s")):
@@ -174,7 +174,7 @@ def _apart(first: Fit, count: int) -> str:
 
 
 def _lost(first: Fit, whole: Fit) -> list[str]:
-    """Columns of which the whole motion leaves larger residuals than the pieces."""
+    """Note on the column whose residuals are largest for the whole motion compared with the pieces, if much larger."""
     sizes = {name: (_rms(whole, name), _rms(first, name)) for name in whole.noise}
     worst = max(sizes, key=lambda name: sizes[name][0] / sizes[name][1])
     ratio = sizes[worst][0] / sizes[worst][1]

@@ -1,4 +1,4 @@
-"""What a measured column observes: a function of the state, with what may be wrong with the instrument.
+"""What a measured column observes: a function of the state, and the errors of the instrument.
 
 An observer is a callable record `observer(state) -> (size, *batch)` for one time; its float leaves can be fitted by
 the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point". Every column has besides
@@ -30,7 +30,7 @@ FIELDS = ("x", "v", "w", "q", "angle")
 
 
 def _first(metadata: dict[str, Any] | None = None) -> Any:
-    """Field that may be given by its place."""
+    """Field that may be given by position."""
     return dataclasses.field(kw_only=False, metadata=metadata)
 
 
@@ -49,7 +49,7 @@ class Part:
 
 @pytree
 class JointPart:
-    """Of a joint: "hinge.angle", up to full turns, or "slider.translation", and the rate of either."""
+    """Coordinate or rate of a joint: "hinge.angle" (up to full turns), "slider.translation", or the rate of either."""
 
     joint: str = static()
     field: str = static()
@@ -172,7 +172,7 @@ class Channel:
 
 
 def predict(channel: Channel, world: World, states: State) -> Array:
-    """What the instrument reads at K times, (K, size, *batch), from states with a leading axis of times."""
+    """Readings of the instrument at K times, (K, size, *batch), for states with a leading axis of times."""
     return channel.scale[None, None] * jax.vmap(partial(_seen, channel.observer, world))(states) + channel.bias[None]
 
 
@@ -186,7 +186,7 @@ def is_angle(channel: Channel) -> bool:
 
 
 def difference(channel: Channel, world: World, states: State, measured: Array) -> Array:
-    """Predicted minus measured, (K, size of the residual, *batch); of angles and turns at most half a turn."""
+    """Predicted minus measured, (K, size of the residual, *batch); at most half a turn for angles and orientations."""
     if _is_turn(channel):
         so, q = rotations(states.x.shape[2]), states.q[:, channel.observer.body]
         return jax.vmap(lambda measured, q: so.log(so.difference(measured, q)))(measured + jnp.zeros_like(q), q)
@@ -203,7 +203,7 @@ def _is_turn(channel: Channel) -> bool:
 
 
 def channel_of(name: str, what: Any, world: World) -> Channel:
-    """The channel of a column from what a user says that it observes.
+    """Make the channel of a column from what a user says that it observes.
 
     Args:
         what: "ball.x", an observer, a Channel around one of them, or a function of the state.
@@ -222,7 +222,7 @@ def channel_of(name: str, what: Any, world: World) -> Channel:
 
 
 def _fill(sizes: dict[str, int], leaf: Any, letters: tuple[str, ...], path: str) -> Any:
-    """A leaf as an array with its axes; a number stands for all components."""
+    """Convert a leaf to an array with its axes; a number stands for all components."""
     axes = tuple(sizes[letter] for letter in letters)
     value = np.asarray(numbers(path, leaf, None))
     value = numbers(path, np.broadcast_to(value, axes) if value.ndim == 0 else value, axes)
@@ -230,7 +230,7 @@ def _fill(sizes: dict[str, int], leaf: Any, letters: tuple[str, ...], path: str)
 
 
 def size_of(observer: Any, world: World) -> int:
-    """Numbers that an observer gives for one time."""
+    """Number of values that an observer returns for one time."""
     sizes, count = axis_sizes(world), len(world.names)
     shapes = {name: (count, sizes[letter]) for name, letter in zip("xqvw", "DQDA", strict=True)}
     dtype = jnp.result_type(world.bodies.mass)
@@ -302,7 +302,7 @@ def write_channel(channels: dict[str, Channel], path: str, value: Array) -> dict
 
 
 def channel_paths(channels: dict[str, Channel]) -> dict[str, list[tuple[str, ...]]]:
-    """Every path of the columns, and the attributes that it stands for."""
+    """Every path of the columns, and the chains of attributes that it stands for."""
     out: dict[str, list[tuple[str, ...]]] = {"clock": [(name, "clock") for name in channels]}
     for name, channel in channels.items():
         fields = ("clock",) if _is_turn(channel) else ("bias", "scale", "clock")

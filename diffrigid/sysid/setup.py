@@ -27,13 +27,13 @@ from diffrigid.sysid.records import Run, noise_guess, runs
 from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
 
-MANY = 50_000  # steps of a record, from which on its times are doubted
-LEAST = 1e-9  # noise that is taken for none
+MANY = 50_000  # steps of a record, beyond which the unit of its times is doubted
+LEAST = 1e-9  # least noise that is estimated
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is free, and all records in arrays."""
+    """The free parameters, and all records in arrays."""
 
     runs: tuple[Run, ...]
     shared: tuple[Slot, ...]
@@ -41,7 +41,7 @@ class Problem:
     groups: tuple[Group, ...]
     dt: float  # [s] the longest step
     width: float  # [m] of smooth impacts
-    window: float  # [s] from the start of each record; what is later has no weight
+    window: float  # [s] from the start of each record; later values have no weight
     noise: dict[str, float]  # of columns whose noise is not given with their record
     free: Mapping[Any, Any]  # as the user gave it
     observe: Mapping[str, Any]  # likewise
@@ -64,10 +64,10 @@ def make_problem(
     resume: Any = None,
     places: Sequence[int | None] | None = None,
 ) -> Problem:
-    """Checks all, and puts it into arrays. Arguments as of `fit`.
+    """Check the arguments, which are those of `fit`, and put all records into arrays.
 
     Args:
-        places: of each record, that of `resume` whose own numbers it takes; None: none. Default in order.
+        places: for each record, the record of `resume` whose own numbers it takes; None: none. Default in order.
     """
     found = runs(world, state, observations, observe or {}, noise)
     pairs = [floats(run.world, run.state) for run in found]
@@ -91,7 +91,7 @@ def make_problem(
 
 
 def _common_width(found: Sequence[Run]) -> float:
-    """[m] of the smooth impacts of all worlds."""
+    """Width [m] of smooth impacts, which all worlds share."""
     widths = sorted({float(run.world.contact.width) for run in found})
     if len(widths) > 1:
         raise ValueError(f"the worlds of the records have contact.width {widths}: expected the same in all of them")
@@ -106,11 +106,11 @@ def scene_of(run: Run) -> Scene:
 def with_noise(
     problem: Problem, noise: Mapping[str, float], window: float | None = None, width: float | None = None
 ) -> Problem:
-    """The problem with weights for this noise.
+    """Set the weights of a problem for this noise.
 
     Args:
         window: [s] of each record from its start; None: as it is.
-        width: [m] of smooth impacts; None: as it is. Until one is smooth, none is compiled to be.
+        width: [m] of smooth impacts; None: as it is. Until one is positive, only exact impacts are compiled.
     """
     window, width = (
         float(old if new is None else new) for old, new in ((problem.window, window), (problem.width, width))
@@ -149,7 +149,7 @@ def _weights(run: Run, name: str, noise: Mapping[str, float], window: float, row
 
 
 def _noise_guesses(found: Sequence[Run]) -> dict[str, float]:
-    """Median over the records of the guess for each column whose noise is not given."""
+    """Noise guessed for each column whose noise is not given: the median over the records."""
     guesses: dict[str, list[float]] = {}
     for run in found:
         for series in run.series:
@@ -179,7 +179,7 @@ def _resumed(found: list[Run], saved: Any, free: Mapping[Any, Any], places: Sequ
 
 
 def first_numbers(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """z of the values in the scenes: (a,), (b, R)."""
+    """Numbers z of the values in the scenes: (a,), (b, R)."""
     shared = [slot.kind.unbounded(np.asarray(_value(problem, slot))) for slot in problem.shared]
     own = [
         [slot.kind.unbounded(np.asarray(reference(slot, scene_of(run)))) for run in problem.runs]
@@ -191,7 +191,7 @@ def first_numbers(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
-    """z of the values in the scenes, and of `count` - 1 random starts."""
+    """Starts: z of the values in the scenes, and of `count` - 1 random ones."""
     random, (first, first_own) = np.random.default_rng(seed), first_numbers(problem)
     shared, own = [first], [first_own]
     for _ in range(count - 1):
@@ -202,12 +202,12 @@ def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
         ]
         own.append(np.concatenate(rows) if rows else first_own)
     dtype = problem.runs[0].state.x.dtype
-    # Everywhere from the beginning: what a solver returns is, and else all would be compiled again for that.
+    # Replicated on all devices, like what a solver returns: else all would be compiled again for that.
     return everywhere(Numbers(*(jax.device_put(np.stack(rows, -1).astype(dtype)) for rows in (shared, own))))
 
 
 def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
-    """The longest step of each number: a factor e^2 for one that z is the logarithm of, or the like; 0 if held."""
+    """Longest step of each number: a factor e^2 for those of which z is a logarithm or similar; 0 if held."""
     dtype = problem.runs[0].state.x.dtype
     parts = []
     for slots in (problem.shared, problem.own):
@@ -219,7 +219,7 @@ def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
 
 
 def _value(problem: Problem, slot: Slot) -> Any:
-    """Reference of a parameter: that of the first record that has it."""
+    """Reference value of a parameter: that of the first record that has it."""
     return reference(slot, scene_having(problem, slot))
 
 
@@ -237,13 +237,13 @@ def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def start_vector(problem: Problem) -> np.ndarray:
-    """z of the values in the scenes: the shared numbers, then those of each record, (a + R b,)."""
+    """Start as one vector: z of the values in the scenes, shared numbers, then those of each record, (a + R b,)."""
     shared, own = first_numbers(problem)
     return np.concatenate([shared, own.T.ravel()])
 
 
 def unpack(problem: Problem, z: np.ndarray) -> Numbers:
-    """A vector (a + R b,) as one start."""
+    """Unpack a vector (a + R b,) as one start."""
     a, b = problem.sizes
     dtype = problem.runs[0].state.x.dtype
     own = np.asarray(z[a:]).reshape(len(problem.runs), b).T
@@ -272,7 +272,7 @@ def jacobian_matrix(problem: Problem, z: np.ndarray) -> np.ndarray:
 
 
 def fitted_scenes(problem: Problem, shared: np.ndarray, own: np.ndarray) -> list[Scene]:
-    """The scene of every record with the parameters z (a,), (b, R) put in."""
+    """Scenes of all records with the parameters z (a,), (b, R) written in."""
     out: list[Any] = [None] * len(problem.runs)
     for group in problem.groups:
         for k, member in enumerate(group.members):
@@ -281,7 +281,7 @@ def fitted_scenes(problem: Problem, shared: np.ndarray, own: np.ndarray) -> list
 
 
 def fitted_scene(problem: Problem, group: Group, k: int, shared: np.ndarray, own: np.ndarray) -> Scene:
-    """Of record k of a group."""
+    """Scene of record k of a group, with the fitted parameters written in."""
     run = problem.runs[group.members[k]]
     z = np.concatenate([shared, own[:, group.members[k]]]).astype(run.state.x.dtype)
     scene = _put(group.plan.slots, scene_of(run), z)

@@ -1,4 +1,4 @@
-"""What is kept of a fit: its table, as text, HTML or JSON."""
+"""The part of a fit that is kept: its table, as text, HTML or JSON."""
 
 import json
 import platform
@@ -18,7 +18,7 @@ from diffrigid.sysid.table import html_table, text_table
 
 @dataclass(frozen=True)
 class Parameter:
-    """One fitted number, or vector; with `records` > 0 that of each record, along a first axis."""
+    """One fitted number or vector; with `records` > 0 those of each record, along a first axis."""
 
     name: str
     value: np.ndarray
@@ -31,13 +31,13 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Summary:
-    """What can be written to a file of a fit."""
+    """The part of a fit that can be written to a file."""
 
     parameters: tuple[Parameter, ...]
     noise: dict[str, float]  # standard deviation of each column's residuals, in its unit
     costs: np.ndarray  # (starts,) the loss of the residuals, lowest first; inf: diverged
     agree: int  # starts that ended at the best cost
-    orders: Orders  # of each start, the best first, and of the first records: which pairs strike, in order of time
+    orders: Orders  # pairs that strike, in order of time, for each start, the best first, and each of the first records
     notes: tuple[str, ...]  # what the data cannot tell, and why not to believe the intervals
     seed: int
     seconds: float
@@ -71,12 +71,12 @@ class Summary:
 
 
 def _part(p: Parameter, name: str, index: int) -> Parameter:
-    """A component of a vector."""
+    """Component of a vector parameter."""
     return replace(p, name=name, value=p.value[..., index], low=p.low[..., index], high=p.high[..., index])
 
 
 def _plain(data: Any) -> Any:
-    """As JSON has it."""
+    """Convert to the types of JSON."""
     if isinstance(data, dict):
         return {key: _plain(value) for key, value in data.items()}
     if isinstance(data, tuple | list):
@@ -87,7 +87,7 @@ def _plain(data: Any) -> Any:
 
 
 def load_fit(path: str | Path) -> Summary:
-    """What `save` wrote: the table, and with `fit(..., resume=...)` where to go on from.
+    """Load what `save` wrote: the table, from which `fit(..., resume=...)` continues.
 
     Example:
         >>> saved = dr.load_fit(found.save("fit.json"))  # the table; a fit goes on from it by resume=saved
@@ -111,6 +111,6 @@ def load_fit(path: str | Path) -> Summary:
 
 
 def versions() -> dict[str, str]:
-    """Of what a result depends on."""
+    """Versions of the software that a result depends on."""
     names = {"diffrigid": version("diffrigid"), "jax": jax.__version__, "numpy": np.__version__}
     return names | {"python": platform.python_version(), "dtype": str(jnp.result_type(float))}

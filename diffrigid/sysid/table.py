@@ -9,7 +9,7 @@ from diffrigid.sysid.orders import in_words
 from diffrigid.tables import as_html, digits, lined_up
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
-BLIND = "not determined, see below"  # of a parameter of which some number has no interval
+BLIND = "not determined, see below"  # note of a parameter with a number that has no interval
 SHOWN = 3  # records whose own numbers are in the table
 
 
@@ -19,7 +19,7 @@ def rows(fit: Any) -> list[tuple[str, ...]]:
 
 
 def rows_of(p: Any) -> list[tuple[str, ...]]:
-    """The rows of one parameter. Of records, {0}, {1}, ..., the first three."""
+    """Rows of one parameter; if each record has its own, those of the first three, {0}, {1}, ..."""
     out: list[tuple[str, ...]] = []
     for index in np.ndindex(p.value.shape):
         record, part = (index[:1], index[1:]) if p.records else ((), index)
@@ -50,7 +50,7 @@ def _starts(fit: Any) -> str:
 
 
 def _others(fit: Any) -> str:
-    """Where the starts that do not agree ended."""
+    """Say where the starts that do not agree ended."""
     others = fit.costs[fit.agree :]
     finite = others[np.isfinite(others)]
     texts = []

@@ -1,4 +1,4 @@
-"""Times of a record: those that were measured, those at which a control changes, and the steps between them."""
+"""Times of a record: measured ones, those at which a control changes, and the steps between them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,14 +13,14 @@ from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.records import SAME, Run
 from diffrigid.trajectory import Trajectory
 
-LONGEST = 0.02  # [s] of a step, where its length is not given and matters
-JITTER = 1.1  # [-] of the usual interval: one that is longer by less is still one step
+LONGEST = 0.02  # [s] longest step, where its length is not given and matters
+JITTER = 1.1  # [-] of the usual interval: a longer one up to this factor is still one step
 
 
 def longest_step(found: Sequence[Run], dt: float | None) -> float:
-    """[s] as given; default the median of the intervals between times, a tenth more for those of a clock that jitters.
+    """Longest step [s]: as given, or the median interval between times, and a tenth more for a clock that jitters.
 
-    Where forces vary or bodies may touch no more than LONGEST.
+    Where forces vary or bodies may touch, no more than LONGEST.
     """
     if dt is not None:
         return float(positive("dt", dt, "it is the longest step in s"))
@@ -30,7 +30,7 @@ def longest_step(found: Sequence[Run], dt: float | None) -> float:
 
 
 def controls_over(run: Run, t: np.ndarray) -> dict[str, np.ndarray] | None:
-    """Controls of a record over steps that begin at times t (S,) [s], (S, size): each value is held until the next."""
+    """Controls (S, size) of a record over steps that begin at times t (S,) [s]: each value is held until the next."""
     rows = {c.name: np.searchsorted(c.t, t + SAME, side="right") - 1 for c in run.controls}
     return {c.name: c.values[np.maximum(rows[c.name], 0)] for c in run.controls} or None
 
@@ -46,12 +46,12 @@ def _once(*times: Any) -> np.ndarray:
 
 
 def _with_changes(run: Run, t: np.ndarray) -> np.ndarray:
-    """Times, and those between them at which a control changes."""
+    """Add to times t those between them at which a control changes."""
     return _once(t, *(c.t[(c.t > t[0]) & (c.t < t[-1])] for c in run.controls))
 
 
 def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
-    """Of a record from its start, at increasing times t (K,) [s] after it; no step is longer than `longest` [s]."""
+    """Motion of a record from its start, at increasing times t (K,) [s] after it, with steps up to `longest` [s]."""
     since = _with_changes(run, _once([run.start], t))
     controls = controls_over(run, since[:-1])
     states = rollout(scene.world, scene.state, dt=longest, times=since - run.start, controls=controls).state
@@ -69,7 +69,7 @@ def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
 
 
 def grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Lengths of the steps that land on every measured time, and for each column the state of each of its rows."""
+    """Lengths of steps that land on every measured time, and for each column the index of the state of each row."""
     t = _with_changes(run, all_times(run))
     gaps = np.diff(t)
     counts = steps_in(gaps, longest)

@@ -1,7 +1,7 @@
-"""`explore`: sliders for parameters of a scene, and its motion and the slope of that beside them, at once.
+"""`explore`: sliders for parameters of a scene, beside its motion and the linear prediction of it.
 
-What a slider moves is an argument of one compiled program, so a new motion takes milliseconds. The player shows two:
-the motion itself, and where its derivative by the parameter moved last says that it goes, a straight line ahead.
+Sliders set arguments of one compiled program, so a new motion takes milliseconds. The player shows two motions: the
+motion itself, and its linear prediction, by the derivative with respect to the parameter moved last.
 """
 
 from collections.abc import Mapping
@@ -22,12 +22,12 @@ from diffrigid.view.frames import record
 from diffrigid.view.play import Player, play
 from diffrigid.world import World, check
 
-AHEAD = 0.05  # of the range of a parameter: how far its slope is followed
+AHEAD = 0.05  # [-] of the range of a parameter: how far the linear prediction goes
 FRAMES = 240  # times that are sent to the browser, at most
 
 
 class Explorer:
-    """What `explore` returns: a notebook shows it, `values` are the numbers by name, `scene` what they make."""
+    """Result of `explore`: a notebook shows it; `values` holds the numbers by name, `scene` the scene with them."""
 
     def __init__(
         self, world: World, state: State, ranges: Mapping[str, tuple[float, float]], *, dt: float, steps: int
@@ -51,7 +51,7 @@ class Explorer:
         self.move(next(iter(self.ranges)), None)
 
     def move(self, name: str, value: float | None) -> None:
-        """Give a parameter a value, None for the one it has, and follow its slope from now on."""
+        """Set a parameter (None: leave its value), and show the linear prediction along it from now on."""
         if name not in self.ranges:
             raise ValueError(f"no slider {name!r}, there are {list(self.ranges)}")
         self.leading, (low, high) = name, self.ranges[name]
@@ -76,28 +76,28 @@ class Explorer:
         return paths.unit(self.trajectory.world, name)
 
     def sliders(self) -> list[dict[str, Any]]:
-        """What the sliders show."""
+        """Name, range, value and unit of every slider."""
         return [
             {"name": name, "low": low, "high": high, "value": self.values[name], "unit": self.unit(name)}
             for name, (low, high) in self.ranges.items()
         ]
 
     def runs(self) -> dict[str, Trajectory]:
-        """The motion and, by a name that says how far, where its slope leads."""
+        """The motion, and its linear prediction under a name that says how far it goes."""
         low, high = self.ranges[self.leading]
         step = f"{AHEAD * (high - low):.3g} {self.unit(self.leading)}".strip()
         return {"motion": self.trajectory, f"its slope by {self.leading}, + {step}": self.slope}
 
     def sources(self) -> list[dict[str, Any]]:
-        """What the player draws of both; contacts of the motion only."""
+        """Data that the player draws of both; contacts of the motion only."""
         return [record(run, name, None, FRAMES, run is self.trajectory) for name, run in self.runs().items()]
 
     def player(self) -> Player:
-        """Both motions as they are now."""
+        """Player of both motions as they are now."""
         return play(self.runs(), frames=FRAMES, show=("trails", "contacts"), plot="")
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        """The widget; where no kernel runs, the motions as they were."""
+        """The widget, and, where no kernel runs, the motions as they were."""
         data, metadata = self.widget._repr_mimebundle_(**options)
         return data | {"text/html": self.player()._repr_html_()}, metadata
 
@@ -105,7 +105,7 @@ class Explorer:
 def explore(
     world: World, state: State, ranges: Mapping[str, tuple[float, float]], *, dt: float, steps: int
 ) -> Explorer:
-    """Sliders for parameters of a scene, beside the motion, which follows as they are dragged, and its slope.
+    """Make sliders for parameters of a scene, beside the motion, which follows as they are dragged, and its slope.
 
     The slope is drawn as a second motion: the linear prediction of where bodies would be if the parameter moved last
     grew by a twentieth of its range. Where the two diverge, as at an impact that appears or vanishes, it fails.
@@ -140,7 +140,7 @@ def _range(name: str, span: Any) -> tuple[float, float]:
 def _with_slope(
     names: tuple[str, ...], world: World, state: State, values: Array, ahead: Array, *, dt: float, steps: int
 ) -> tuple[Trajectory, Trajectory]:
-    """The motion, and the same moved by its derivative along `ahead`."""
+    """The motion, and the motion plus its derivative along `ahead`."""
 
     def path(values: Array) -> Trajectory:
         changed = world, state

@@ -18,7 +18,7 @@ from diffrigid.view.outline import outline
 
 
 def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
-    """Outlines of all bodies at evenly spaced stored times, the later the darker, and their paths [m]. 2D."""
+    """Draw the outlines of all bodies at evenly spaced stored times, the later the darker, and their paths [m]. 2D."""
     world, ax = checked(trajectory).world, _axes(ax)
     if world.dim != 2:
         raise ValueError("strobe draws 2D motions: for 3D use play, or plot components of state.x")
@@ -35,7 +35,7 @@ def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
 
 
 def film(trajectory: Trajectory, path: str | Path, speed: float = 1.0, rate: int = 30) -> Path:
-    """Write a 2D motion as .gif, or as .mp4 if ffmpeg is there, at so many pictures a second; 1 is real time."""
+    """Write a 2D motion as .gif, or as .mp4 if ffmpeg is there, at `rate` pictures a second; `speed` 1 is real time."""
     world, ax, path = checked(trajectory).world, _axes(None), Path(path)
     if world.dim != 2:
         raise ValueError("film draws 2D motions: for 3D use play")
@@ -60,7 +60,7 @@ def film(trajectory: Trajectory, path: str | Path, speed: float = 1.0, rate: int
 
 
 def energy(trajectory: Trajectory, ax: Any = None) -> Any:
-    """Kinetic, potential (gravity and springs) and total energy [J] of all bodies over time."""
+    """Plot kinetic, potential (gravity and springs) and total energy [J] of all bodies over time."""
     world, ax, t = checked(trajectory).world, _axes(ax), np.asarray(trajectory.t)
     for column, name in zip(energies(world, trajectory.state).T, ("kinetic", "potential", "total"), strict=True):
         ax.plot(t, column, label=name, color="k" if name == "total" else None)
@@ -68,7 +68,7 @@ def energy(trajectory: Trajectory, ax: Any = None) -> Any:
 
 
 def momentum(trajectory: Trajectory, angular: bool = False, ax: Any = None) -> Any:
-    """Components of the momentum of all bodies [N s] over time, or of the angular one about the origin [N m s]."""
+    """Plot the momentum of all bodies [N s] over time, or their angular momentum about the origin [N m s]."""
     world, ax, t = checked(trajectory).world, _axes(ax), np.asarray(trajectory.t)
     last = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), 0, -1), trajectory.state)
     of = of_state.angular_momentum if angular else of_state.momentum
@@ -79,7 +79,7 @@ def momentum(trajectory: Trajectory, angular: bool = False, ax: Any = None) -> A
 
 
 def phase(trajectory: Trajectory, body: str, axis: str = "x", ax: Any = None) -> Any:
-    """Velocity [m/s] against position [m] of a body along an axis, or angular velocity against "angle" (2D)."""
+    """Plot velocity [m/s] against position [m] of a body along an axis, or angular velocity against "angle" (2D)."""
     world, ax, state = checked(trajectory).world, _axes(ax), trajectory.state
     names = ["x", "y", "angle"] if world.dim == 2 else ["x", "y", "z"]
     if body not in world.names or axis not in names:
@@ -108,7 +108,7 @@ def _outlines(world: Any) -> list[tuple[int, np.ndarray]]:
 
 
 def _stage(ax: Any, world: Any, x: np.ndarray, shapes: list) -> None:
-    """What does not move, and limits that hold the whole motion."""
+    """Draw the statics, and set limits that contain the whole motion."""
     moving, pad = len(world.names), 0.0
     for owner, lines in shapes:
         if owner < moving:

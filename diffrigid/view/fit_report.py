@@ -1,4 +1,4 @@
-"""What `fit.report("fit.html")` writes: a page with all that is known of a fit, from the parts of `view.report`."""
+"""The page that `fit.report("fit.html")` writes: all that is known of a fit, from the parts of `view.report`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +18,8 @@ from diffrigid.view.play import Player, play
 from diffrigid.view.report import Section, chart, matrix, write_report
 from diffrigid.view.report import Series as Curve
 
-LASTS = 4.0  # [s] a motion is slowed down to, if it is shorter
-NEAR = 4.0  # times the level of the interval: what is drawn of a profile
+LASTS = 4.0  # [s] shorter motions are slowed down to last this long
+NEAR = 4.0  # [-] times the level of the interval: up to there a profile is drawn
 LEAD = """Values with 95 % intervals, what the data cannot tell, the fitted motion over what was measured, and what is
 left of the residuals. This file needs nothing but itself."""
 
@@ -66,7 +66,7 @@ def motion_player(fit: Any, motions: Sequence[Trajectory]) -> Player:
     data = {f"record {k}": measured(fit, k) for k in range(len(motions))}
     known = {name: columns for name, columns in data.items() if columns}
     x = np.asarray(motions[0].state.x, float)
-    axis = "xyz"[int(np.ptp(x, axis=0).max(0).argmax())]  # along which most happens
+    axis = "xyz"[int(np.ptp(x, axis=0).max(0).argmax())]  # along which bodies move most
     duration = float(motions[0].t[-1] - motions[0].t[0])
     speed = min(1.0, float(f"{duration / LASTS:.1g}"))
     if len(motions) == 1:
@@ -76,7 +76,7 @@ def motion_player(fit: Any, motions: Sequence[Trajectory]) -> Player:
 
 
 def measured(fit: Any, record: int) -> dict[str, Any]:
-    """Columns of a record that are parts of a state, by what they observe, freed of bias, scale and clock."""
+    """Columns of a record that are parts of a state, by what they observe, corrected for bias, scale and clock."""
     scene, out = fit.scenes[record], {}
     for series in fit.problem.runs[record].series:
         channel = scene.channels[series.name]
@@ -107,7 +107,7 @@ def impacts(motion: Trajectory) -> np.ndarray:
 
 
 def residual_chart(fit: Any, record: int, series: Series, events: np.ndarray) -> str:
-    """Residuals of one column over time; "" where nothing of it was measured."""
+    """Chart of the residuals of one column over time; "" where nothing of it was measured."""
     values = fit.residuals[record][series.name][: len(series.t)]
     if not np.isfinite(values).any():
         return ""
@@ -118,7 +118,7 @@ def residual_chart(fit: Any, record: int, series: Series, events: np.ndarray) ->
 
 
 def _by_record(fit: Any) -> str:
-    """Root mean square of the residuals of every record: which of them do not fit."""
+    """Chart of the root mean square of the residuals of every record: it shows which of them do not fit."""
     joined = [np.concatenate([column.ravel() for column in record.values()]) for record in fit.residuals]
     size = np.array([np.sqrt(np.nanmean(r**2)) if np.isfinite(r).any() else np.nan for r in joined])
     curve = Curve(np.arange(len(size)), size, points=True)
@@ -136,7 +136,7 @@ def _search(fit: Any, found: Sequence[Profile]) -> Section:
 
 
 def _costs(fit: Any) -> str:
-    """Where every start ended, the lowest first, in colours by the order of impacts."""
+    """Chart of the cost at which every start ended, the lowest first, coloured by the order of impacts."""
     over = np.round(np.log10(fit.costs / max(fit.costs[0], 1e-300)), 3)
     groups = [np.array(members) for members in alike(fit.orders)]
     groups = [*groups[:2], np.concatenate(groups[2:])] if len(groups) > 2 else groups
@@ -146,7 +146,7 @@ def _costs(fit: Any) -> str:
 
 
 def profile_chart(found: Profile) -> str:
-    """Rise of the cost when one number is held; dashed: the ends of its interval."""
+    """Chart of the rise of the cost when one number is held; dashed: the ends of its interval."""
     near = found.rise < NEAR * found.level
     values, rise = found.values[near], found.rise[near]
     level = Curve(values, np.full(len(values), found.level), "95 % level", 1)

@@ -1,4 +1,4 @@
-"""What a player draws, as plain data for JSON: times, poses, shapes, joints, energies, measured columns. NumPy.
+"""Data that a player draws, ready for JSON: times, poses, shapes, joints, energies, measured columns. NumPy.
 
 Columns of numbers are packed as 16-bit integers, see `pack`. Colliders are numbered as in `World`: bodies, then
 statics; the world itself comes last.
@@ -55,7 +55,7 @@ def times(t: np.ndarray) -> Any:
 def record(
     trajectory: Trajectory, name: str, data: Mapping[str, Any] | None, frames: int, touching: bool = True
 ) -> dict[str, Any]:
-    """All that is drawn of one trajectory, at no more than `frames` of its times; its contacts if `touching`."""
+    """All data drawn of one trajectory, at no more than `frames` of its times; with its contacts if `touching`."""
     world, t = trajectory.world, np.asarray(trajectory.t, float)
     kept = np.unique(np.rint(np.linspace(0, len(t) - 1, min(len(t), frames))).astype(int))
     some = jax.tree.map(lambda leaf: np.asarray(leaf, float)[kept], trajectory.state)
@@ -83,13 +83,13 @@ def poses(trajectory: Trajectory) -> np.ndarray:
 
 
 def contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
-    """Rows by time: t [s], 1 for an impact or 0 for rest, point (D) [m], impulse (D) [N s] on one that moves."""
+    """Contacts by time: t [s], 1 for impact or 0 for rest, point (D) [m], impulse (D) [N s] on a body that moves."""
     found = impacts.contacts(trajectory, t_drawn)
     return np.column_stack([found.t, found.impact, found.point, found.impulse])
 
 
 def _turns(t: np.ndarray, q: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Angles (T, N, 1), with as many turns as the angular velocities say, however fast."""
+    """Angles (T, N, 1), unwrapped by means of the angular velocities, however fast."""
     angle = np.arctan2(q[:, :, 1:], q[:, :, :1])
     expected = np.diff(t)[:, None, None] * (w[1:] + w[:-1]) / 2
     away = np.diff(angle, axis=0) - expected
@@ -207,7 +207,7 @@ def measured(world: World, data: Mapping[str, Any], t_drawn: np.ndarray, drawn: 
 
 
 def _places(field: str, values: np.ndarray, dim: int):
-    """Where a column goes in the table of poses; angular velocities are not drawn."""
+    """Yield the place of a column in the table of poses, and its values; angular velocities are not drawn."""
     turn = 1 if dim == 2 else 4
     if field == "x":
         yield slice(0, dim), values
@@ -220,6 +220,6 @@ def _places(field: str, values: np.ndarray, dim: int):
 
 
 def _short(leaf: Any) -> Any:
-    """Numbers or nested lists with 7 digits."""
+    """Round to 7 digits: a number, or nested lists."""
     array = np.asarray(leaf, float)
     return float(f"{array:.7g}") if array.ndim == 0 else [_short(row) for row in array]

@@ -1,4 +1,4 @@
-"""Outlines of shapes: the lines that a drawing of one needs, NumPy."""
+"""Outlines of shapes: the lines that a drawing needs. NumPy."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ REACH = 50.0  # [m] half width of a drawn half space
 
 
 def outline(shape: Shape, dim: int, points: int = 48):
-    """Lines to draw, NumPy: in 2D one closed polyline (P, 2) [m], in 3D a list of polylines (P_i, 3) [m].
+    """Lines that draw a shape, NumPy: in 2D one closed polyline (P, 2) [m], in 3D a list of polylines (P_i, 3) [m].
 
     Round parts have about `points` points a turn. A half space is a long segment (2, 2), or a large square;
     a profile is its line between its ends, a height field the lines of its grid.
@@ -78,7 +78,7 @@ def _closed(polyline):
 
 
 def _raised(polyline, axes):
-    """A plane polyline (P, 2) put into the plane of two of the three axes, (P, 3)."""
+    """Put a plane polyline (P, 2) into the plane of two of the three axes, (P, 3)."""
     raised = np.zeros((len(polyline), 3))
     raised[:, axes] = polyline
     return raised

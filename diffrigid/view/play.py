@@ -1,4 +1,4 @@
-"""`play`: a trajectory, or several, as one piece of HTML that needs nothing else.
+"""`play`: one or several trajectories as self-contained HTML.
 
 The page is made of a style (`player.css`), the controls (`player.js`, `graph.js`), a way of drawing (`flat.js` on a
 canvas in 2D, `solid.js` with three.js in 3D) and the data of `frames`. A notebook shows it in a frame of its own, so
@@ -40,7 +40,7 @@ UNPACK = """(async () => {
 
 @dataclass(frozen=True)
 class Player:
-    """A page that plays; a notebook shows it by itself.
+    """An HTML page with a player; a notebook shows it as it is.
 
     Example:
         >>> dr.play({"exact": trajectory, "smooth": dr.rollout(widths[0], state, dt=1 / 60, steps=30)}).height
@@ -72,17 +72,17 @@ def play(
     beside: bool = False, speed: float = 1.0, show: Iterable[str] = ("trails", "contacts", "data"),
     plot: str = "energy", frames: int = 600, height: int = 520, theme: str = "auto", title: str = "",
 ) -> Player:  # fmt: skip
-    """A player of a trajectory, 2D or 3D, with what was measured of it.
+    """Make a player of a trajectory, 2D or 3D, with measured data over it.
 
     Args:
         trajectory: what `rollout` returns; or several by name, drawn over each other.
-        data: measured columns as `fit` takes them, "t" [s], "ball.x", "ball.angle" or "ball.q"; NaN is missing. Of
-            joints nothing is drawn. For several trajectories also such columns by their names.
-        beside: several trajectories side by side.
-        speed: at which it starts; 1 is real time.
+        data: measured columns as `fit` takes them, "t" [s], "ball.x", "ball.angle" or "ball.q"; NaN is missing. Columns
+            of joints are not drawn. For several trajectories also such columns by their names.
+        beside: draw several trajectories side by side.
+        speed: initial speed; 1 is real time.
         show: what is shown at first, of "trails", "velocities", "contacts", "data".
         plot: "energy", "speed", "x", "y", "z" (3D), "angle" (2D), "vx", "vy", "vz", or "" for none.
-        frames: the most times that are kept, evenly; between them bodies move on curves through positions and
+        frames: largest number of times that are kept, evenly; between them bodies move on curves through positions and
             velocities, with a corner at an impact.
         height: [px] of the player in a notebook.
         theme: "light", "dark", or "auto", that of the browser.
@@ -130,7 +130,7 @@ def _check(runs: Mapping[str, Trajectory], show: Iterable[str], theme: str, spee
 
 
 def _data_by_run(runs: Mapping[str, Trajectory], data: Any, beside: bool) -> dict[str, Any]:
-    """The columns of each trajectory: by name, or the same for all, which are drawn once."""
+    """Columns of each trajectory: by name, or the same for all, then drawn once."""
     by_name = isinstance(data, Mapping) and "t" not in data and data
     if by_name and all(isinstance(part, Mapping) for part in data.values()):
         if unknown := set(data) - set(runs):
@@ -155,7 +155,7 @@ def _page(content: Mapping[str, Any], dim: int, theme: str, title: str) -> str:
 
 @functools.cache
 def _packed_scripts(dim: int) -> str:
-    """The scripts, compressed, in base64: a fourth of their size, so that notebooks stay small."""
+    """The scripts, compressed, in base64, so that notebooks stay small."""
     names = ("player.js", "graph.js", *(("flat.js",) if dim == 2 else ("three/three.min.js", "solid.js")))
     licence = "" if dim == 2 else f"/* three.js:\n{_file('three/LICENSE-three')}*/\n"
     text = licence + "\n".join(map(_file, names))

@@ -1,4 +1,4 @@
-"""A report of fits as one HTML file that needs nothing else: tables, players, charts, text.
+"""A report of fits as one self-contained HTML file: tables, players, charts, text.
 
     write_report("report.html", "Title", "What this is.", [Section(title="...", player=play(...))])
 
@@ -40,7 +40,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Series:
-    """Points, or a line, of a chart; NaN is left out."""
+    """Points, or a line, of a chart; NaN is skipped."""
 
     x: np.ndarray
     y: np.ndarray
@@ -66,7 +66,7 @@ def write_report(path: str | Path, title: str, lead: str, sections: Sequence[Sec
 
 
 def row(name: str, values: Sequence[float] | np.ndarray, unit: str, reference: str) -> Row:
-    """One row of a table: value, low, high with as many digits as show the interval to two places."""
+    """One row of a table: value, low, high with enough digits to show the interval to two places."""
     v, l, h = (float(number) for number in values)
     places = digits(v, l, h, 2)
     value, low, high = (f"{number:#.{places}g}".rstrip(".") for number in (v, l, h))
@@ -87,7 +87,7 @@ def chart(
     title: str, x_label: str, y_label: str, series: Sequence[Series], width: int = WIDTH,
     events: Sequence[float] = (), margin: float = 0.0,
 ) -> str:  # fmt: skip
-    """A chart as SVG: axes with ticks, lines and points, a legend above.
+    """Draw a chart as SVG: axes with ticks, lines and points, a legend above.
 
     Args:
         events: x of dashed lines across.
@@ -115,7 +115,7 @@ def chart(
 
 
 def matrix(title: str, names: Sequence[str], values: np.ndarray) -> str:
-    """A square table of numbers from -1 to 1 as SVG, the stronger the larger; colour 0 above zero, 1 below."""
+    """Draw a square matrix of numbers from -1 to 1 as SVG, stronger for larger ones; colour 0 above zero, 1 below."""
     count, left = len(names), min(12 + 6.5 * max(map(len, names)), 0.45 * WIDTH)
     cell = min(46.0, (WIDTH - left - RIGHT) / count)
     height = TOP + cell * count + 24

@@ -13,7 +13,7 @@ except ImportError:
 
 
 class Sliders(anywidget.AnyWidget):
-    """A slider is moved in the browser, which sends its name and value; the motions come back."""
+    """Sliders in the browser: one that is moved sends its name and value, and the motions are sent back."""
 
     _esm = (files(__package__) / "explore.js").read_text(encoding="utf-8")
     page = traitlets.Unicode().tag(sync=True)
@@ -23,7 +23,7 @@ class Sliders(anywidget.AnyWidget):
 
 
 def widget_of(explorer: Explorer) -> Sliders:
-    """Sliders that move the explorer, and show its motions."""
+    """Make sliders that set the values of an explorer, and show its motions."""
     widget = Sliders(page=explorer.player().page, sliders=explorer.sliders(), runs=explorer.sources())
 
     def follow(change: Any) -> None:
