@@ -333,6 +333,69 @@ def test_what_is_round_slides_and_rolls_over_a_dome(shape, rolling):
         assert_allclose(slopes[1:], jax.jacfwd(theory, (1, 2))(*p), atol=slope)
 
 
+HIGH = 0.3  # [m] of the centre of what slides over the middle of the rod
+
+
+def on_a_rod_that_turns(start, om, u, steps):
+    """Place [m] after 0.1 s of a disc that slips outwards along a rod, so heavy that it turns evenly; nothing rubs."""
+    disc = dr.Body(dr.Disc(radius=0.1), mass=0.5, x=vector(start, HIGH), v=vector(u - om * HIGH, om * start))
+    rod = dr.Body(dr.Box(half=(2.0, HIGH - 0.1)), mass=1e9, x=(0.0, 0.0), w=om)
+    world, state = dr.scene({"disc": disc, "rod": rod}, restitution=0.4)
+    return dr.rollout(world, state, dt=0.1 / steps, steps=steps)["disc.x"][-1]
+
+
+def on_a_rod_in_closed_form(start, om, u):
+    """Along the rod x'' = om^2 x; across, the rod presses with 2 om u - om^2 HIGH > 0 to begin with."""
+    along, (cos, sin) = start * jnp.cosh(0.1 * om) + u / om * jnp.sinh(0.1 * om), (jnp.cos(0.1 * om), jnp.sin(0.1 * om))
+    return jnp.stack([along * cos - HIGH * sin, along * sin + HIGH * cos])
+
+
+def test_a_side_that_turns_presses_without_any_force():
+    """The Coriolis force holds them together: of second order in the step, slopes too."""
+    p = tuple(map(jnp.asarray, (-0.3, 6.0, 3.0)))
+    exact, exact_slopes = jax.jit(with_slopes(on_a_rod_in_closed_form))(*p)
+    errors = []
+    for steps in (12, 24):
+        place, slopes = jax.jit(with_slopes(partial(on_a_rod_that_turns, steps=steps)))(*p)
+        errors.append(
+            [np.abs(place - exact).max(), *(np.abs(a - b).max() for a, b in zip(slopes, exact_slopes, strict=True))]
+        )
+    coarse, fine = np.array(errors)
+    assert np.all(fine < 1e-4)
+    assert np.all(fine < 0.3 * coarse)
+
+
+def after_a_step_that_missed_it(p):
+    """Velocities after a step from where a disc has sunk into the side of a box that turns, and still closes."""
+    x = vector(p["along"], 0.35 + p["gap"])
+    v = vector(p["u"] - p["om"] * (0.35 + p["gap"]), p["om"] * p["along"] + p["speed"])
+    bodies = {
+        "box": dr.Body(dr.Box(half=(0.4, 0.2)), mass=1.5, x=(0.0, 0.0), w=p["om"]),
+        "disc": dr.Body(dr.Disc(radius=0.15), mass=0.6, x=x, v=v),
+    }
+    world, state = dr.scene(bodies, restitution=0.4)
+    return dr.step(world, state, 1 / 240).v
+
+
+def test_what_has_sunk_into_a_side_that_turns_has_the_slope_of_its_repair():
+    """It parts, is pressed back, and closes again inside: that impact is not where the gap vanishes."""
+    rng, count, h = np.random.default_rng(0), 64, 1e-7
+    p = {
+        "gap": -(10.0 ** rng.uniform(-5, -3, count)),
+        "speed": -(10.0 ** rng.uniform(-2.5, -0.5, count)),
+        "om": rng.uniform(4, 12, count),
+        "u": rng.uniform(1, 5, count),
+        "along": rng.uniform(-0.3, 0.3, count),
+    }
+    ways = {name: {other: jnp.full(count, float(other == name)) for other in p} for name in p}
+    each = jax.jit(jax.vmap(lambda p, way: jax.jvp(after_a_step_that_missed_it, (p,), (way,))))
+    for way in ways.values():
+        value, slope = each(p, way)
+        up, down = (each({n: p[n] + h * sign * way[n] for n in p}, way)[0] for sign in (1.0, -1.0))
+        right = np.abs(slope - (up - down) / (2 * h)).max((1, 2)) < 1e-4 * (1.0 + np.abs(slope).max((1, 2)))
+        assert np.mean(right) > 0.98, np.flatnonzero(~right)  # but for a kink
+
+
 def slides_into(p):
     """Places at rest, (2,) [m], of a block that slides into another; both rub on the floor."""
     along, up = jnp.eye(2)

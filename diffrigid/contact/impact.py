@@ -75,9 +75,11 @@ def find_impact(
     along = moving_along(a, at_a, s0), moving_along(b, at_b, s0)
     slope = lax.stop_gradient(share * gap_rates(moved, *along)).sum(0)  # for derivatives only: a rollout is spared it
     s = implicit_root(s0, (share * moved.gap).sum(0) - level, slope)
-    # What is already inside where the paths begin is struck there, whatever its gap.
-    at_once = jnp.any(closes & (gap < lax.stop_gradient(level - slack)[None]), 0) & (s0 <= begin)
-    s = jnp.where(at_once, begin, s)
+    # A contact that is inside where the paths begin is struck there, whatever its gap; one that turns round inside, and
+    # closes again, where it is found: neither is where a gap vanishes.
+    inside = closes & (gap < lax.stop_gradient(level - slack)[None])
+    s = jnp.where(inside.any(0) & ~there.any(0), jnp.where(s0 < t1, s0, t1), s)
+    s = jnp.where(inside.any(0) & (s0 <= begin), begin, s)
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
     if len(rests) != len(gap):  # contacts are a selection: of the corners of a box, or of places on a grid
         few = isinstance(b.shape, HalfSpace)

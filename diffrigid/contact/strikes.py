@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.branches import any_world, opaque_true, unfused
-from diffrigid.collide import Contacts
+from diffrigid.collide import Contacts, PairGroup
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.impact import find_impact
@@ -26,7 +26,7 @@ from diffrigid.joints import Weld
 from diffrigid.linkage import ends_of, islands
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
-from diffrigid.shapes import HalfSpace, HeightField, Profile
+from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Sphere
 from diffrigid.state import rotations
 
 DEEPEST = 0.2  # [-] of the smaller reach: deeper penetration is resolved in several steps
@@ -77,19 +77,28 @@ def _joined(parts: list[Strikes]) -> Strikes:
 def waits(world: Any) -> bool:
     """Whether resting contacts may have to be held until an impact. Static.
 
-    That is so beside friction or motors of joints, and with forces where a body may touch several others, or one of
+    That is so beside friction or motors of joints, and with loads where a body may touch several others, or one of
     them at several points.
     """
     column, drives = ends(world), driven(world)
     pairs = tuple(dict.fromkeys(zip(column["a"], column["b"], strict=True)))
     a, b = zip(*pairs, strict=True)
     alone = are_alone(a, b, len(world.names)) and all(pairs.count == 1 for pairs in world.pairs)
-    return not all(drives) and (any(drives) or (bool(world.forces) and not alone))
+    return not all(drives) and (any(drives) or (is_loaded(world) and not alone))
 
 
 def is_loaded(world: Any) -> bool:
-    """Whether resting contacts carry a load: there are forces, or friction or motors of joints. Static."""
-    return bool(world.forces) or any(driven(world))
+    """Whether resting contacts may carry a load. Static.
+
+    They do by forces and joints, and without both by rotation: a side that turns presses what slips along it, or lies
+    on it. Round bodies have no sides, and corners on a half-space swing away from it.
+    """
+
+    def turns_a_side(pairs: PairGroup) -> bool:
+        kinds = type(world.shapes[pairs.shape_a]), type(world.shapes[pairs.shape_b])
+        return kinds[1] is not HalfSpace and not all(issubclass(kind, Disc | Sphere) for kind in kinds)
+
+    return bool(world.forces or world.joints) or any(map(turns_a_side, world.pairs))
 
 
 def next_meeting(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
@@ -127,10 +136,13 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
         arms = (a, at_a, lever.arm_a), (b, at_b, lever.arm_b)
         pulls: list[Any] = [acceleration(side, at, s, arm, lever.rate) for side, at, arm in arms]
         pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
+        v_rel = relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b)
+        if turns and moving is not None:  # d(n . v_rel)/dt is of the normal, too
+            pull = pull + dot(moving.normal, v_rel)[None] * contact.normal
         return Strikes(
             active=gap < 0, s=s, gap=gap, rounding=rounding, deepest=DEEPEST * size, normal=contact.normal,
             arm_a=lever.arm_a, arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
-            K=effective_matrix(at_a, at_b, lever), v_rel=relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b),
+            K=effective_matrix(at_a, at_b, lever), v_rel=v_rel,
             pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip
 
