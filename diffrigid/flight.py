@@ -14,7 +14,7 @@ the orientation (Munthe-Kaas 1998): fourth order. Then jerk, jolt, twist and tur
 the integration ends.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,9 @@ from diffrigid.linkage import joint_wrench
 from diffrigid.numerics import safe_divide
 from diffrigid.pytree import array, pytree, replace, static
 from diffrigid.state import State, Wrench, rotations, spin
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 
 @pytree
@@ -50,7 +53,7 @@ class Flight:
 
 
 @jax.jit  # so that it is traced once for all passes of a step
-def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Flight:
+def launch(world: "World", state: State, controls: Any, t0: Array, t1: Array) -> Flight:
     """Free motion of all bodies from `state`, each at its own time t0 (N, *batch), to t1 (*batch) [s]."""
     bodies, varies = world.bodies, not is_constant(world.forces) or bool(world.joints)
     so = rotations(bodies.dim)
@@ -71,7 +74,7 @@ def launch(world: Any, state: State, controls: Any, t0: Array, t1: Array) -> Fli
     return _along(flight, *_runge_kutta(world, flight, controls, t1[None] - t0), t1[None] - t0, has_torque(world))
 
 
-def _wrench(world: Any, state: State, controls: Any, span: Array) -> Wrench:
+def _wrench(world: "World", state: State, controls: Any, span: Array) -> Wrench:
     """All forces on free bodies, and those of the joints, for an integration over span (*batch) [s]."""
     wrench = total_wrench(world.forces, world.bodies, state, controls)
     return joint_wrench(world.joints, world.statics, world.bodies, state, wrench, span) if world.joints else wrench
@@ -87,12 +90,12 @@ class Motion:
     L: Array = array("N", "A")
 
 
-def has_torque(world: Any) -> bool:
+def has_torque(world: "World") -> bool:
     """Whether joints or forces exert torques. Static."""
     return bool(world.joints) or any(getattr(force, "twists", True) for force in world.forces)
 
 
-def _runge_kutta(world: Any, f: Flight, controls: Any, T: Array) -> tuple[Motion, Motion, Array, Array]:
+def _runge_kutta(world: "World", f: Flight, controls: Any, T: Array) -> tuple[Motion, Motion, Array, Array]:
     """Rates at the anchor, their mean over T (N, *batch) [s], the mean of the first three stages' accelerations
     (N, D, *batch) [m/s^2], which moves x by T^2 / 2, and the rate of phi at the end (N, A, *batch) [rad/s].
 

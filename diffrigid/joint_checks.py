@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,10 @@ from diffrigid.linkage import ends_of, to_sides
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
 from diffrigid.shapes import traced
-from diffrigid.state import rotations
+from diffrigid.state import State, rotations
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 
 def joints_of(
@@ -142,12 +145,12 @@ def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:
             raise ValueError(f"{name} starts at {float(at):g}, outside its limits {lower:g} to {upper:g}: move a body.")
 
 
-def warn_of_torn_joints(world: Any, state: Any) -> None:
+def warn_of_torn_joints(world: "World", state: State) -> None:
     """Warn of joints that the initial velocities violate."""
     if not world.joints:
         return
 
-    def speeds(world: Any, state: Any) -> Any:
+    def speeds(world: "World", state: State) -> Any:
         parts = []
         for group in world.joints:
             at = placed((group,), world.statics, state.x, state.q)

@@ -6,7 +6,7 @@ world; if both are free, that of body a.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,9 @@ from diffrigid.numerics import dot
 from diffrigid.pytree import replace
 from diffrigid.state import State, rotations
 
+if TYPE_CHECKING:
+    from diffrigid.world import World
+
 COORDINATE = {Revolute: "angle", Prismatic: "translation"}
 RATE = "rate"
 
@@ -28,7 +31,7 @@ def fields_of(joint: Any) -> tuple[str, ...]:
     return (COORDINATE[type(joint)], RATE) if type(joint) in COORDINATE else ()
 
 
-def read(world: Any, state: State, name: str, field: str) -> Array:
+def read(world: "World", state: State, name: str, field: str) -> Array:
     """The angle [rad], the translation [m] or the rate [rad/s, m/s] of a joint, (*batch)."""
     so, at = rotations(world.dim), _at(world, state, name)
 
@@ -38,7 +41,7 @@ def read(world: Any, state: State, name: str, field: str) -> Array:
     return change(so, coordinate, at.a, at.b, at.twists) if field == RATE else coordinate(at.a, at.b)
 
 
-def write(world: Any, state: State, name: str, field: str, value: Array) -> State:
+def write(world: "World", state: State, name: str, field: str, value: Array) -> State:
     """Change a state, without batch axes, so that `read` gives the value. Velocities turn with the bodies."""
     side, bodies = moving_side(world, name)
     by, rows = value - read(world, state, name, field), jnp.array(bodies)
@@ -47,7 +50,7 @@ def write(world: Any, state: State, name: str, field: str, value: Array) -> Stat
     return replace(state, **{leaf: getattr(state, leaf).at[rows].set(new) for leaf, new in moved.items()})
 
 
-def moving_side(world: Any, name: str) -> tuple[int, tuple[int, ...]]:
+def moving_side(world: "World", name: str) -> tuple[int, tuple[int, ...]]:
     """Side of a joint that moves when it is set, 0 for that of a, and its bodies, that of the joint first.
 
     No bodies if both sides are connected without the joint, so that neither moves alone.
@@ -77,7 +80,7 @@ class _At(NamedTuple):
     twists: Array  # (2, D + A, *batch)
 
 
-def _at(world: Any, state: State, name: str) -> _At:
+def _at(world: "World", state: State, name: str) -> _At:
     group, row = next((g, names.index(name)) for g, names in enumerate(world.joint_names) if name in names)
     (at,) = placed(world.joints[group : group + 1], world.statics, state.x, state.q)
     twists = to_sides(ends_of(world.joints[group : group + 1]), jnp.concatenate([state.v, state.w], axis=1))
@@ -97,7 +100,7 @@ class _Motion(NamedTuple):
     pivot: Array  # (D,) [m] where the anchor belongs, before it moves
 
 
-def _motion(world: Any, at: _At, side: int, by: Array) -> _Motion:
+def _motion(world: "World", at: _At, side: int, by: Array) -> _Motion:
     so, joint = rotations(world.dim), at.joint
     anchors = [pose.x + so.rotate(pose.q, anchor) for pose, anchor in ((at.a, joint.anchor_a), (at.b, joint.anchor_b))]
     bodies = [(at.twists[0], at.a.x), (at.twists[1], at.b.x)]

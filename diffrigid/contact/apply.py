@@ -5,7 +5,7 @@ and x by (T / 2) P / m: its centroid is in the middle of that time, and so are i
 that slides on a floor with Coulomb friction this is exact; for one that tips over, of second order.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +26,12 @@ from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.pytree import replace
 from diffrigid.state import State, rotations
 
+if TYPE_CHECKING:
+    from diffrigid.world import World
+
 
 def apply_impulses(
-    world: Any,
+    world: "World",
     anchors: Anchors,
     flight: Flight,
     strikes: Strikes,
@@ -95,7 +98,7 @@ def _no_faster_than_drift(mobility: Mobility, dL: Array, strikes: Strikes) -> Ar
 
 
 def _solved(
-    world: Any, at: tuple[Flight, Array, Mobility], strikes: Strikes, law: Law, kick: Array, held_for: Array,
+    world: "World", at: tuple[Flight, Array, Mobility], strikes: Strikes, law: Law, kick: Array, held_for: Array,
     known: Known | None, count: Array,
 ) -> tuple[Strikes, Law, Array, Array, Array]:  # fmt: skip
     """Strikes, law and times with the rolling rows, the unknown impulses, and their corrections for early stops."""
@@ -125,7 +128,7 @@ def _onto_joints(flight: Flight, t: Array, link: Linkage, hit: Array) -> tuple[A
     return spread(link, on * v, on * jax.vmap(apply)(link.inverse_inertia, L))
 
 
-def _posed(world: Any, flight: Flight, t: Array, ago: Array) -> tuple[Array, Mobility, Linkage | None]:
+def _posed(world: "World", flight: Flight, t: Array, ago: Array) -> tuple[Array, Mobility, Linkage | None]:
     """Orientations of all bodies, each at its own time t (N, *batch), their mobility there, and their joints.
 
     Args:

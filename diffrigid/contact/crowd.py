@@ -11,7 +11,7 @@ Resting contacts are not held here, so these worlds have no forces.
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,9 @@ from diffrigid.numerics import FOUND, dot, norm
 from diffrigid.pytree import map_arrays, pytree, replace
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State, rotations
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 MANY = 256  # bodies, the least for which this way is taken
 SHARE = 8  # bodies per slot of a round
@@ -56,7 +59,7 @@ def is_many(kinds: Any, owners: Any, moving: int, alone: bool) -> bool:
 class Crowd:
     """The M bodies of all worlds, side by side; values that all share have a last axis of 1."""
 
-    world: Any  # of one body
+    world: "World"  # of one body
     shape: Any
     materials: list[Material]
     dt: Array  # (M,) [s]
@@ -79,7 +82,7 @@ class Encounters(NamedTuple):
     there: Array  # (E,) bool
 
 
-def step_crowd(world: Any, state: State, dt: Array) -> State:
+def step_crowd(world: "World", state: State, dt: Array) -> State:
     """State of a crowd after dt (*batch) [s]."""
     crowd, start = _side_by_side(world, dt), _states(state, dt.shape)
     t0 = jnp.zeros_like(start.x[:, 0])
@@ -94,7 +97,7 @@ def step_crowd(world: Any, state: State, dt: Array) -> State:
     return jax.tree.map(back, end)
 
 
-def without_room(world: Any, state: State, dt: Array) -> Array:
+def without_room(world: "World", state: State, dt: Array) -> Array:
     """Number of neighbours, summed over the bodies of one crowd, without room in a step of dt () [s]; ()."""
     near = _near(world, _side_by_side(world, dt), _states(state, ()))
     return jnp.maximum(near.found - len(near.other), 0).sum()
@@ -119,7 +122,7 @@ def _states(state: State, batch: tuple[int, ...]) -> State:
     return map_arrays(lambda leaf, *_: _columns(leaf, True, len(leaf), batch)[None], state)
 
 
-def _side_by_side(world: Any, dt: Array) -> Crowd:
+def _side_by_side(world: "World", dt: Array) -> Crowd:
     count, batch = len(world.names), dt.shape
 
     def of_bodies(leaf: Array, *_: Any) -> Array:
@@ -139,7 +142,7 @@ def _side_by_side(world: Any, dt: Array) -> Crowd:
     return Crowd(world=one, shape=jax.tree.map(of_bodies, shape), materials=own, dt=of_all(dt))
 
 
-def _walls(world: Any, batch: tuple[int, ...]) -> list[Walls]:
+def _walls(world: "World", batch: tuple[int, ...]) -> list[Walls]:
     """All statics, by kind."""
     count, walls = len(world.names), []
 
@@ -160,7 +163,7 @@ def _walls(world: Any, batch: tuple[int, ...]) -> list[Walls]:
     return walls
 
 
-def _near(world: Any, crowd: Crowd, start: State) -> Near:
+def _near(world: "World", crowd: Crowd, start: State) -> Near:
     """Neighbours that each body can touch within the step, at the speeds of its start."""
     fastest = norm(start.v[0]).max()
     x, reach = start.x[0], crowd.shape.radius + fastest * crowd.dt

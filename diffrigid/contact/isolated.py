@@ -9,7 +9,7 @@ same time, none comes to rest, and the slots suffice; else the general way, with
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,13 +30,16 @@ from diffrigid.numerics import dot
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import rotations
 
+if TYPE_CHECKING:
+    from diffrigid.world import World
+
 RESTS = -1e30  # [s] marks an impact after which the bodies stay together
 CROWDED = 4  # pairs per body from which this way is faster than the list of pairs
 SHARE = 8  # bodies for each slot of a round
 ROUNDS = 3  # at most, for the impacts of a pass; most passes need one, and reverse mode pays for each
 
 
-def goes_in_rounds(world: Any) -> bool:
+def goes_in_rounds(world: "World") -> bool:
     """Whether all bodies are discs, or spheres, whose impact times have a closed form, in many pairs. Static."""
     moving, count = len(world.names), sum(len(pairs.a) for pairs in world.pairs)
     bodies = [(kind, owner) for kind, owners in enumerate(world.owners) for owner in owners if owner < moving]
@@ -50,7 +53,7 @@ def goes_in_rounds(world: Any) -> bool:
     return count > CROWDED * moving and quiet and one_disc_each and all(map(solved, world.pairs))
 
 
-def tables_of(world: Any) -> tuple[Table, ...]:
+def tables_of(world: "World") -> tuple[Table, ...]:
     """Tables of all pairs of a crowded world."""
     moving = len(world.names)
 
@@ -74,7 +77,7 @@ class Next(NamedTuple):
     other: Array  # (N, *batch) the other collider, a body or a static
 
 
-def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: Array, dt: Array):
+def next_impacts(world: "World", tables: tuple[Table, ...], flight: Flight, since: Array, dt: Array):
     """The next impact of each body, if any.
 
     Returns:
@@ -116,7 +119,7 @@ def next_impacts(world: Any, tables: tuple[Table, ...], flight: Flight, since: A
 
 
 def meet_in_rounds(
-    world: Any, tables: tuple[Table, ...], following: Next, needed: Array, anchors: Anchors, launch: Any, dt: Array
+    world: "World", tables: tuple[Table, ...], following: Next, needed: Array, anchors: Anchors, launch: Any, dt: Array
 ) -> Anchors:
     """Anchors after the next impact of each body; rounds that no world needs are skipped."""
     count, live = slots_of(len(world.names)), opaque_true(dt)
@@ -166,7 +169,7 @@ def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Ar
     return Slots(a, unfused(live, of_b, *unfused(live, sides, a, following), following))
 
 
-def _times(live: Array, world: Any, table: Table, flight: Flight, since: Array, dt: Array) -> Array:
+def _times(live: Array, world: "World", table: Table, flight: Flight, since: Array, dt: Array) -> Array:
     """Times of the next impacts (A, B, *batch) [s]; inf: none in this step; RESTS: without rebound."""
     a, b = sides_of_table(world, table, flight, since)
     if table.b[0] < a.flight.t0.shape[0]:
@@ -174,7 +177,7 @@ def _times(live: Array, world: Any, table: Table, flight: Flight, since: Array, 
     return unfused(live, functools.partial(_times_to_statics, world, table), a, b, dt)
 
 
-def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Array) -> Array:
+def _times_of_pairs(world: "World", table: Table, bodies: Side, since: Array, dt: Array) -> Array:
     """Time of the next impact of each two bodies, (N, N, *batch) [s]: `meet_on_line`, without derivatives."""
 
     def at_start(flight: Flight) -> tuple[Array, Array]:
@@ -198,7 +201,7 @@ def _times_of_pairs(world: Any, table: Table, bodies: Side, since: Array, dt: Ar
     return _allowed(table, unfused(live, jax.vmap(jax.vmap(one, (None, 0)), (0, None)), lines, lines))
 
 
-def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
+def _times_to_statics(world: "World", table: Table, a: Side, b: Side, dt: Array) -> Array:
     """Time of the next impact of each body with each static, (N, B, *batch) [s]."""
     if isinstance(b.shape, HalfSpace):
         times = _times_to_planes(world, table, a, b, dt)
@@ -212,7 +215,7 @@ def _times_to_statics(world: Any, table: Table, a: Side, b: Side, dt: Array) -> 
     return _allowed(table, times)
 
 
-def _times_to_planes(world: Any, table: Table, a: Side, b: Side, dt: Array) -> Array:
+def _times_to_planes(world: "World", table: Table, a: Side, b: Side, dt: Array) -> Array:
     so, live, f = rotations(a.flight.dim), opaque_true(dt), a.flight
     straight = relative_path_is_straight(world, both_move=False)
     names = ("restitution", "restitution_falloff")

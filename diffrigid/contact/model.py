@@ -15,7 +15,7 @@ the next step, at a negative time, and repaired.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,9 @@ from diffrigid.gathers import flags
 from diffrigid.numerics import FOUND, PASSED, dot, safe_divide, saving, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 IMPACT, HOLD, REVERSE, PUSH = 0, 1, 2, 3
 HOLDS = 2  # passes to hold resting contacts until the first impact: one to its time in free fall, one from there
@@ -82,7 +85,7 @@ class Contact:
     sweeps: int = static(default=4)
     neighbours: int = static(default=8)
 
-    def __call__(self, world: Any, state: State, launch: Callable, dt: Array) -> State:
+    def __call__(self, world: "World", state: State, launch: Callable, dt: Array) -> State:
         """State after a step of length dt (*batch) [s].
 
         Args:
@@ -102,7 +105,7 @@ class Contact:
             end = lax.cond(near, passes, lambda start: start, start)
         return state_at(launch(end.state, end.t0), dt)
 
-    def _passes(self, world: Any, start: Anchors, launch: Callable, dt: Array) -> Anchors:
+    def _passes(self, world: "World", start: Anchors, launch: Callable, dt: Array) -> Anchors:
         """The anchors after all passes."""
         always = driven(world)  # acts in every step, without an impact before
         resting = jnp.broadcast_to(flags(always, start.t0), (len(always), *start.t0.shape[1:]))
@@ -141,11 +144,11 @@ class Contact:
         first = Progress(start, resting, known, jnp.asarray(True), rests)
         return checkpoint_name(lax.scan(maybe, first, jnp.array(self._phases(world)))[0].anchors, PASSED)
 
-    def _phases(self, world: Any) -> list[int]:
+    def _phases(self, world: "World") -> list[int]:
         impacts, loaded = self.sweeps + HOLDS * waits(world), is_loaded(world)
         return [IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH]
 
-    def saved_numbers(self, world: Any) -> int:
+    def saved_numbers(self, world: "World") -> int:
         """Approximate count of numbers saved per step (FOUND, PASSED) for reverse mode without recomputing the step."""
         if not ends(world)["a"]:
             return 0
@@ -154,7 +157,7 @@ class Contact:
         return len(self._phases(world)) * (of_bodies + of_rows)
 
 
-def _rows(world: Any) -> int:
+def _rows(world: "World") -> int:
     """Number of rows: contacts, rolling rows, and rows of joints. Static."""
     return len(driven(world)) + is_rolling(world) * contact_count(world)
 
@@ -169,7 +172,7 @@ class Progress(NamedTuple):
     rests: Array  # (*batch) bool: some contact of a world rests
 
 
-def _pass(world: Any, now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
+def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
     anchors, resting, known, _, rests = now
     impact, reverse, push = (phase == kind for kind in (IMPACT, REVERSE, PUSH))
     flight = launch(anchors.state, anchors.t0)
@@ -207,7 +210,7 @@ def _closed(strikes: Strikes, opened: Array) -> Array:
 
 
 def _demanded(
-    world: Any, anchors: Anchors, flight: Flight, strikes: Strikes, resting: Array, dt: Array, phase: Array
+    world: "World", anchors: Anchors, flight: Flight, strikes: Strikes, resting: Array, dt: Array, phase: Array
 ) -> tuple[Strikes, Law, Array, Array]:
     """Contacts that take part in a pass, their law, for how long [s] they are held, and which contacts rest.
 
@@ -237,7 +240,7 @@ def _demanded(
 
 
 def _held(
-    world: Any, strikes: Strikes, resting: Array, stays: Array, fallen: Array, phase: Array
+    world: "World", strikes: Strikes, resting: Array, stays: Array, fallen: Array, phase: Array
 ) -> tuple[Array, Array]:
     """Which contacts are held in this pass, and which rest after it, (C, *batch) bool.
 
@@ -254,7 +257,7 @@ def _held(
     return held, jnp.where(impact, resting | held | comes, jnp.where(phase == REVERSE, resting, held))
 
 
-def _fallen(world: Any, flight: Flight, strikes: Strikes, closing_acc: Array, dt: Array) -> Array:
+def _fallen(world: "World", flight: Flight, strikes: Strikes, closing_acc: Array, dt: Array) -> Array:
     """Largest closing speed (C, *batch) [m/s] that a resting contact reaches in a step of free fall of both bodies."""
     fall = dt[None] * jnp.sqrt((flight.a**2).sum(1))
     of_both = jnp.maximum(at_colliders(fall, strikes.a, 0.0), at_colliders(fall, strikes.b, 0.0))

@@ -7,7 +7,7 @@ Source: the documentation of MuJoCo, whose coefficients of spinning and rolling 
 """
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,12 @@ from diffrigid.numerics import dot, norm, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 
+if TYPE_CHECKING:
+    from diffrigid.world import World
+
 
 def with_rows(
-    world: Any, strikes: Strikes, law: Law, T: Array, flight: Flight, t: Array, mobility: Mobility, kick: Array
+    world: "World", strikes: Strikes, law: Law, T: Array, flight: Flight, t: Array, mobility: Mobility, kick: Array
 ) -> tuple[Strikes, Law, Array]:
     """Add the rolling rows to the strikes, law and times T of `solve_impulses`.
 
@@ -69,7 +72,7 @@ def with_rows(
     return strikes, law, _behind(count, T, T[:count])
 
 
-def _of_contacts(world: Any, name: str, zero: Array) -> Array:
+def _of_contacts(world: "World", name: str, zero: Array) -> Array:
     """Coefficient `name` of all contacts, zero if the world does not have it."""
     if getattr(world.bodies, name) is None:
         return zero

@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,9 @@ from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import BOUNDLESS, HeightField, radius
 from diffrigid.state import rotations
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 
 @pytree
@@ -48,13 +51,13 @@ class Placed:
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
 
 
-def sides_of(world: Any, pairs: PairGroup, flight: Flight, since: Array) -> tuple[Side, Side]:
+def sides_of(world: "World", pairs: PairGroup, flight: Flight, since: Array) -> tuple[Side, Side]:
     """Both sides of P pairs of one kind, every array with a leading axis P."""
     a = side_of(world, flight, since, pairs.shape_a, pairs.row_a, pairs.a)
     return a, side_of(world, flight, since, pairs.shape_b, pairs.row_b, pairs.b)
 
 
-def side_of(world: Any, flight: Flight, since: Array, kind: int, shape_rows: tuple, colliders: tuple) -> Side:
+def side_of(world: "World", flight: Flight, since: Array, kind: int, shape_rows: tuple, colliders: tuple) -> Side:
     """Side with shapes `shape_rows` of world.shapes[kind], on colliders that all move or are all static."""
     moving = flight.t0.shape[0]
 

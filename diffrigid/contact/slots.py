@@ -6,7 +6,7 @@ indexing along the batch this vectorises, in both directions.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,9 @@ from diffrigid.gathers import fold, pack
 from diffrigid.numerics import dot
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 
 class Table(NamedTuple):
@@ -52,7 +55,7 @@ class Blow(NamedTuple):
     mu: Array  # (E, *batch) [-]
 
 
-def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, launch: Any, dt: Array) -> Anchors:
+def meet(world: "World", tables: tuple[Table, ...], slots: Slots, anchors: Anchors, launch: Any, dt: Array) -> Anchors:
     """The anchors after the impacts in the slots."""
     flight, so, live = launch(anchors.state, anchors.t0), rotations(world.dim), opaque_true(dt)
     moving, count = len(world.names), slots.a.shape[0]
@@ -107,12 +110,12 @@ def meet(world: Any, tables: tuple[Table, ...], slots: Slots, anchors: Anchors, 
     return Anchors(state=state, t0=t0, since=since)
 
 
-def _static(world: Any, table: Table, flight: Flight, since: Array) -> tuple:
+def _static(world: "World", table: Table, flight: Flight, since: Array) -> tuple:
     """The statics of a table, and their materials."""
     return sides_of_table(world, table, flight, since)[1], materials(world, table.b)
 
 
-def sides_of_table(world: Any, table: Table, flight: Flight, since: Array) -> tuple[Side, Side]:
+def sides_of_table(world: "World", table: Table, flight: Flight, since: Array) -> tuple[Side, Side]:
     a = side_of(world, flight, since, table.pairs.shape_a, table.rows_a, tuple(range(len(table.rows_a))))
     return a, side_of(world, flight, since, table.pairs.shape_b, table.rows_b, table.b)
 

@@ -7,7 +7,7 @@ up to its bound. The scalars of a row are the first component of the vectors of 
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,9 @@ from diffrigid.numerics import FOUND, implicit_root, safe_divide, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 
+if TYPE_CHECKING:
+    from diffrigid.world import World
+
 SEARCH = 8  # Newton steps, kept in their bracket, for the time at which a nearly straight path strikes a limit
 
 
@@ -34,23 +37,23 @@ class Stop(NamedTuple):
     kind: str  # "lower", "upper" or "friction"
 
 
-def stops_of(world: Any) -> tuple[Stop, ...]:
+def stops_of(world: "World") -> tuple[Stop, ...]:
     """The rows of a world, for each group of joints one after the other."""
     kinds = ("lower", "upper", "friction")
     return tuple(Stop(k, kind) for k, g in enumerate(world.joints) for kind in kinds if _has(g, kind))
 
 
-def stop_ends(world: Any, side: str) -> tuple[int, ...]:
+def stop_ends(world: "World", side: str) -> tuple[int, ...]:
     """Colliders of the rows; the world itself counts as the last."""
     return tuple(end for stop in stops_of(world) for end in getattr(world.joints[stop.group], side))
 
 
-def is_drive(world: Any) -> tuple[bool, ...]:
+def is_drive(world: "World") -> tuple[bool, ...]:
     """Whether each row is friction or a motor, not a limit."""
     return tuple(stop.kind == "friction" for stop in stops_of(world) for _ in world.joints[stop.group].a)
 
 
-def of_stops(world: Any, field: str, kinds: tuple[str, ...], other: float, batch: tuple[int, ...]) -> Array:
+def of_stops(world: "World", field: str, kinds: tuple[str, ...], other: float, batch: tuple[int, ...]) -> Array:
     """Values of the joints' `field` for rows of these `kinds`, and `other` for the rest, (R, *batch)."""
     parts = []
     for stop in stops_of(world):
@@ -60,7 +63,7 @@ def of_stops(world: Any, field: str, kinds: tuple[str, ...], other: float, batch
     return jnp.concatenate([jnp.broadcast_to(part, part.shape[:1] + batch) for part in parts])
 
 
-def meet_stops(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array) -> Meeting:
+def meet_stops(world: "World", flight: Flight, since: Array, dt: Array, at_end: Array) -> Meeting:
     """Meetings of all rows: when each limit is struck, or the end of the step; friction and motors act at the end.
 
     Args:
@@ -76,7 +79,7 @@ def meet_stops(world: Any, flight: Flight, since: Array, dt: Array, at_end: Arra
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def find_stops(world: Any, flight: Flight, meeting: Meeting) -> Strikes:
+def find_stops(world: "World", flight: Flight, meeting: Meeting) -> Strikes:
     """Strikes of the rows of all joints, at their meetings."""
     padded, parts, start = _with_statics(world, flight), [], 0
     for stop in stops_of(world):
@@ -88,7 +91,7 @@ def find_stops(world: Any, flight: Flight, meeting: Meeting) -> Strikes:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def _rows_of(world: Any, stop: Stop, padded: Flight) -> tuple[Any, list[Flight]]:
+def _rows_of(world: "World", stop: Stop, padded: Flight) -> tuple[Any, list[Flight]]:
     """The joints of a group, and the flights of their bodies."""
     group = world.joints[stop.group]
     sides = [jax.tree.map(lambda leaf, ends=ends: rows(leaf, ends), padded) for ends in (group.a, group.b)]
@@ -182,7 +185,7 @@ def _second(gap: Callable, s: Array) -> Array:
     return jax.jvp(lambda s: jax.jvp(gap, (s,), (one,))[1], (s,), (one,))[1]
 
 
-def _with_statics(world: Any, flight: Flight) -> Flight:
+def _with_statics(world: "World", flight: Flight) -> Flight:
     """The flights of all colliders: bodies, then statics and the world, which do not move."""
     count = len(world.static_names) + 1
     world_q = jnp.zeros_like(flight.q[:1]).at[:, 0].set(1.0)

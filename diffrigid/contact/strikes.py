@@ -1,7 +1,7 @@
 """One list of all contacts of a world, whatever the kinds of their shapes, followed by the rows of its joints."""
 
 import functools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -29,11 +29,14 @@ from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Sphere
 from diffrigid.state import rotations
 
+if TYPE_CHECKING:
+    from diffrigid.world import World
+
 DEEPEST = 0.2  # [-] of the smaller reach: deeper penetration is resolved in several steps
 ROUNDING = 1e2  # [-] times eps times (size + a tenth of the coordinates): accuracy to which gaps are known
 
 
-def find_strikes(world: Any, flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array) -> Strikes:
+def find_strikes(world: "World", flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array) -> Strikes:
     """List the contacts of every pair at its next impact, or the time it is held until; `at_end` (bool): at the end.
 
     Active are contacts that touch then, those of an impact only if it happens before the end. A contact that was
@@ -74,7 +77,7 @@ def _joined(parts: list[Strikes]) -> Strikes:
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
 
 
-def waits(world: Any) -> bool:
+def waits(world: "World") -> bool:
     """Whether resting contacts may have to be held until an impact. Static.
 
     That is so beside friction or motors of joints, and with loads where a body may touch several others, or one of
@@ -87,7 +90,7 @@ def waits(world: Any) -> bool:
     return not all(drives) and (any(drives) or (is_loaded(world) and not alone))
 
 
-def is_loaded(world: Any) -> bool:
+def is_loaded(world: "World") -> bool:
     """Whether resting contacts may carry a load. Static.
 
     They do by forces and joints, and without both by rotation: a side that turns presses what slips along it, or lies
@@ -101,13 +104,13 @@ def is_loaded(world: Any) -> bool:
     return bool(world.forces or world.joints) or any(map(turns_a_side, world.pairs))
 
 
-def next_meeting(world: Any, a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
+def next_meeting(world: "World", a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
     """The next impact of one pair, or the end of the step where `at_end` (a bool)."""
     straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
     return find_impact(a, b, dt, width, straight, world.contact.rest_speed, at_end)
 
 
-def next_strikes(world: Any, a: Side, b: Side, dt: Array) -> Strikes:
+def next_strikes(world: "World", a: Side, b: Side, dt: Array) -> Strikes:
     """The contacts of one pair at its next exact impact, (K, ...)."""
     meeting, never = next_meeting(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
     return strikes_of(a, b, replace(meeting, now=meeting.fast, joins=never, held=never), never[None], dt, False)
@@ -149,12 +152,12 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     return replace(jax.vmap(each)(contacts, moving), active=active, rests=meeting.rests)
 
 
-def relative_path_is_straight(world: Any, both_move: bool) -> bool:
+def relative_path_is_straight(world: "World", both_move: bool) -> bool:
     """Whether relative paths are straight lines: two bodies may fall alike, but not a body and a static."""
     return is_uniform(world.forces) and not world.joints if both_move else not (world.forces or world.joints)
 
 
-def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
+def may_meet(world: "World", flight: Flight, dt: Array) -> Array:
     """False (a bool) if no two bounding spheres of any pair in any world of the batch can touch within the step.
 
     The test costs a fraction of the search for impacts, and lets a step without any skip everything else.
@@ -188,7 +191,7 @@ def may_meet(world: Any, flight: Flight, dt: Array) -> Array:
     return functools.reduce(jnp.logical_or, near)
 
 
-def ends(world: Any) -> dict[str, tuple[int, ...]]:
+def ends(world: "World") -> dict[str, tuple[int, ...]]:
     """Colliders a and b of every contact, then of every row of a joint."""
 
     def column(of):
@@ -198,7 +201,7 @@ def ends(world: Any) -> dict[str, tuple[int, ...]]:
     return {"a": a + stop_ends(world, "a"), "b": b + stop_ends(world, "b")}
 
 
-def wholes(world: Any) -> tuple:
+def wholes(world: "World") -> tuple:
     """Label each contact or row by the two rigid clusters it connects (welded bodies are one; so are all statics)."""
     moving, count, pairs = len(world.names), contact_count(world), ends(world)
     whole = [min(body) for body in islands(ends_of(g for g in world.joints if isinstance(g, Weld)), moving)]
@@ -218,7 +221,7 @@ class Material:
     given: Array = array("M")  # (M, *batch) 1 if it was given to the collider itself, 0 if it is the scene's
 
 
-def material(world: Any, name: str, colliders: tuple[int, ...]) -> Material:
+def material(world: "World", name: str, colliders: tuple[int, ...]) -> Material:
     """Look up the coefficient `name` for the given colliders."""
     moving, still = getattr(world.bodies, name), getattr(world.statics, name)
     batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
@@ -231,7 +234,7 @@ def material(world: Any, name: str, colliders: tuple[int, ...]) -> Material:
 LAW = ("restitution", "friction", "restitution_falloff")
 
 
-def materials(world: Any, colliders: tuple[int, ...], names: tuple[str, ...] = LAW) -> list[Material]:
+def materials(world: "World", colliders: tuple[int, ...], names: tuple[str, ...] = LAW) -> list[Material]:
     """Look up those of `names` that the world has; by default the coefficients that `law` takes."""
     return [material(world, name, colliders) for name in names if getattr(world.bodies, name) is not None]
 
@@ -244,13 +247,13 @@ def law(a: list[Material], b: list[Material], strike: Strikes) -> tuple[Array, A
     return e, mu
 
 
-def coefficients(world: Any, name: str, batch: tuple[int, ...]) -> Array:
+def coefficients(world: "World", name: str, batch: tuple[int, ...]) -> Array:
     """Coefficient `name` of all contacts and rows of joints, (C, *batch) or broadcastable to it."""
     index = {side: ends(world)[side][: contact_count(world)] for side in "ab"}
     return _coefficients(world, name, index["a"], index["b"], batch)
 
 
-def _coefficients(world: Any, name: str, a: tuple[int, ...], b: tuple[int, ...], batch: tuple[int, ...]) -> Array:
+def _coefficients(world: "World", name: str, a: tuple[int, ...], b: tuple[int, ...], batch: tuple[int, ...]) -> Array:
     """Coefficient `name` between colliders a and b, followed by that of the rows of joints."""
     parts = [mixed(*(material(world, name, side) for side in (a, b)))] if world.pairs else []
     if stops_of(world):
@@ -260,18 +263,18 @@ def _coefficients(world: Any, name: str, a: tuple[int, ...], b: tuple[int, ...],
     return jnp.concatenate(whole) if len(parts) > 1 else parts[0]
 
 
-def is_rolling(world: Any) -> bool:
+def is_rolling(world: "World") -> bool:
     """Whether there is friction against rolling or spinning. Static."""
     bodies = world.bodies
     return bool(world.pairs) and not (bodies.rolling_friction is None and bodies.spinning_friction is None)
 
 
-def driven(world: Any) -> tuple[bool, ...]:
+def driven(world: "World") -> tuple[bool, ...]:
     """Whether each contact or row is joint friction or a motor (two-sided, always active)."""
     return (False,) * contact_count(world) + is_drive(world)
 
 
-def driving(world: Any, target: Array) -> tuple[Array, Array | None]:
+def driving(world: "World", target: Array) -> tuple[Array, Array | None]:
     """`target` with the speeds of motors filled in, and bounds of joint friction and motors [N or N m]; None: none."""
     if not any(is_drive(world)):
         return target, None
@@ -282,7 +285,7 @@ def driving(world: Any, target: Array) -> tuple[Array, Array | None]:
     return target, jnp.concatenate([jnp.zeros_like(target[:points]), force])
 
 
-def contact_count(world: Any) -> int:
+def contact_count(world: "World") -> int:
     """Number of contacts of all pairs, without the rows of joints."""
     return sum(len(pairs.a) * pairs.count for pairs in world.pairs)
 

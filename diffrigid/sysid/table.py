@@ -1,21 +1,24 @@
 """The table of a fit, as text and as HTML."""
 
 import html
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diffrigid.sysid.orders import in_words
 from diffrigid.tables import as_html, digits, lined_up
 
+if TYPE_CHECKING:
+    from diffrigid.sysid.summary import Summary
+
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
 BLIND = "not determined, see below"  # note of a parameter with a number that has no interval
 SHOWN = 3  # records whose own numbers are in the table
 
 
-def rows(fit: Any) -> list[tuple[str, ...]]:
+def rows(summary: "Summary") -> list[tuple[str, ...]]:
     """One row for every number: name, value, interval, unit, note."""
-    return [row for p in fit.parameters for row in rows_of(p)]
+    return [row for p in summary.parameters for row in rows_of(p)]
 
 
 def rows_of(p: Any) -> list[tuple[str, ...]]:
@@ -36,40 +39,40 @@ def rows_of(p: Any) -> list[tuple[str, ...]]:
     return out
 
 
-def below(fit: Any) -> list[str]:
+def below(summary: "Summary") -> list[str]:
     """Lines under the table: on the starts, the noise and the time; and on the order of impacts."""
-    impacts = in_words(fit.orders, len(fit.costs))
-    return [_starts(fit), *([impacts] if impacts else [])]
+    impacts = in_words(summary.orders, len(summary.costs))
+    return [_starts(summary), *([impacts] if impacts else [])]
 
 
-def _starts(fit: Any) -> str:
-    noise = ", ".join(f"{name} {value:.3g}" for name, value in fit.noise.items())
-    parts = [f"{fit.agree} of {len(fit.costs)} starts agree{_others(fit)}"]
-    parts += [f"noise: {noise}"] if len(fit.noise) <= 6 else []
-    return "; ".join([*parts, f"{fit.seconds:.1f} s"])
+def _starts(summary: "Summary") -> str:
+    noise = ", ".join(f"{name} {value:.3g}" for name, value in summary.noise.items())
+    parts = [f"{summary.agree} of {len(summary.costs)} starts agree{_others(summary)}"]
+    parts += [f"noise: {noise}"] if len(summary.noise) <= 6 else []
+    return "; ".join([*parts, f"{summary.seconds:.1f} s"])
 
 
-def _others(fit: Any) -> str:
+def _others(summary: "Summary") -> str:
     """Say where the starts that do not agree ended."""
-    others = fit.costs[fit.agree :]
+    others = summary.costs[summary.agree :]
     finite = others[np.isfinite(others)]
     texts = []
     if len(finite):
         texts.append(
-            f"{len(finite)} ended elsewhere, at a cost of {finite[0]:.4g} or more, the best at {fit.costs[0]:.4g}"
+            f"{len(finite)} ended elsewhere, at a cost of {finite[0]:.4g} or more, the best at {summary.costs[0]:.4g}"
         )
     if len(finite) < len(others):
         texts.append(f"{len(others) - len(finite)} diverged")
     return f" ({', '.join(texts)})" if texts else ""
 
 
-def text_table(fit: Any) -> str:
+def text_table(summary: "Summary") -> str:
     """The table in plain text, with the notes under it."""
-    return "\n".join([*lined_up(HEADER, rows(fit)), *below(fit), *(f"! {note}" for note in fit.notes)])
+    return "\n".join([*lined_up(HEADER, rows(summary)), *below(summary), *(f"! {note}" for note in summary.notes)])
 
 
-def html_table(fit: Any) -> str:
+def html_table(summary: "Summary") -> str:
     """The table for a notebook."""
-    notes = "".join(f"<li>{html.escape(note)}</li>" for note in fit.notes)
-    lines = "".join(f"<p>{html.escape(line)}</p>" for line in below(fit))
-    return as_html(HEADER, rows(fit)) + lines + (f"<ul>{notes}</ul>" if notes else "")
+    notes = "".join(f"<li>{html.escape(note)}</li>" for note in summary.notes)
+    lines = "".join(f"<p>{html.escape(line)}</p>" for line in below(summary))
+    return as_html(HEADER, rows(summary)) + lines + (f"<ul>{notes}</ul>" if notes else "")

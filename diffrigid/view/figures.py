@@ -4,7 +4,7 @@ view.strobe(trajectory).figure.savefig("motion.pdf")
 """
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -15,6 +15,9 @@ from diffrigid.touch import rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.view.frames import energies
 from diffrigid.view.outline import outline
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 
 def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
@@ -97,7 +100,7 @@ def _poses(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(trajectory.state.x, float), np.asarray(trajectory.state.q, float)
 
 
-def _outlines(world: Any) -> list[tuple[int, np.ndarray]]:
+def _outlines(world: "World") -> list[tuple[int, np.ndarray]]:
     """Collider and closed outline (P, 2) [m], about its centre, of every shape."""
     found = []
     for group, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
@@ -107,7 +110,7 @@ def _outlines(world: Any) -> list[tuple[int, np.ndarray]]:
     return found
 
 
-def _stage(ax: Any, world: Any, x: np.ndarray, shapes: list) -> None:
+def _stage(ax: Any, world: "World", x: np.ndarray, shapes: list) -> None:
     """Draw the statics, and set limits that contain the whole motion."""
     moving, pad = len(world.names), 0.0
     for owner, lines in shapes:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,13 +18,16 @@ from diffrigid.view.play import Player, play
 from diffrigid.view.report import Section, chart, matrix, write_report
 from diffrigid.view.report import Series as Curve
 
+if TYPE_CHECKING:
+    from diffrigid.sysid.result import Fit
+
 LASTS = 4.0  # [s] shorter motions are slowed down to last this long
 NEAR = 4.0  # [-] times the level of the interval: up to there a profile is drawn
 LEAD = """Values with 95 % intervals, what the data cannot tell, the fitted motion over what was measured, and what is
 left of the residuals. This file needs nothing but itself."""
 
 
-def report(fit: Any, path: str | Path, title: str, profiles: Sequence[str]) -> Path:
+def report(fit: "Fit", path: str | Path, title: str, profiles: Sequence[str]) -> Path:
     """Write the page. The motion and the residuals are those of the first three records."""
     found = [profile(fit, name) for name in profiles]
     fit = with_profiles(fit, found)
@@ -34,16 +37,16 @@ def report(fit: Any, path: str | Path, title: str, profiles: Sequence[str]) -> P
     return write_report(path, title, " ".join(LEAD.split()), [*sections, _origin(fit)])
 
 
-def _numbers(fit: Any) -> Section:
+def _numbers(fit: "Fit") -> Section:
     return Section(
         title="What was found",
-        table=rows(fit),
+        table=rows(fit.summary),
         header=(*HEADER[:-1], "remark"),
         paragraphs=[line + "." for line in below(fit.summary)],
     )
 
 
-def _unknown(fit: Any) -> Section:
+def _unknown(fit: "Fit") -> Section:
     title = "What the data cannot tell"
     if fit.notes:
         return Section(title=title, notes=fit.notes)
@@ -51,7 +54,7 @@ def _unknown(fit: Any) -> Section:
     return Section(title=title, paragraphs=[text])
 
 
-def _motion(fit: Any, motions: Sequence[Trajectory]) -> Section:
+def _motion(fit: "Fit", motions: Sequence[Trajectory]) -> Section:
     hidden = len(fit.scenes) - len(motions)
     text = "The fitted motion from the start of each record; dots are what was measured."
     return Section(
@@ -61,7 +64,7 @@ def _motion(fit: Any, motions: Sequence[Trajectory]) -> Section:
     )
 
 
-def motion_player(fit: Any, motions: Sequence[Trajectory]) -> Player:
+def motion_player(fit: "Fit", motions: Sequence[Trajectory]) -> Player:
     """The fitted motions side by side, over those columns that are poses or velocities of bodies."""
     data = {f"record {k}": measured(fit, k) for k in range(len(motions))}
     known = {name: columns for name, columns in data.items() if columns}
@@ -75,7 +78,7 @@ def motion_player(fit: Any, motions: Sequence[Trajectory]) -> Player:
     return play(runs, known or None, beside=True, speed=speed, plot=axis, height=620)
 
 
-def measured(fit: Any, record: int) -> dict[str, Any]:
+def measured(fit: "Fit", record: int) -> dict[str, Any]:
     """Columns of a record that are parts of a state, by what they observe, corrected for bias, scale and clock."""
     scene, out = fit.scenes[record], {}
     for series in fit.problem.runs[record].series:
@@ -87,7 +90,7 @@ def measured(fit: Any, record: int) -> dict[str, Any]:
     return out
 
 
-def _residuals(fit: Any, motions: Sequence[Trajectory]) -> Section:
+def _residuals(fit: "Fit", motions: Sequence[Trajectory]) -> Section:
     charts = [
         part
         for k, motion in enumerate(motions)
@@ -106,7 +109,7 @@ def impacts(motion: Trajectory) -> np.ndarray:
     return np.unique(np.round(found.t[found.impact], 6))
 
 
-def residual_chart(fit: Any, record: int, series: Series, events: np.ndarray) -> str:
+def residual_chart(fit: "Fit", record: int, series: Series, events: np.ndarray) -> str:
     """Chart of the residuals of one column over time; "" where nothing of it was measured."""
     values = fit.residuals[record][series.name][: len(series.t)]
     if not np.isfinite(values).any():
@@ -117,7 +120,7 @@ def residual_chart(fit: Any, record: int, series: Series, events: np.ndarray) ->
     return chart(title, "time [s]", "residual [standard deviations]", curves, events=events.tolist(), margin=0.02)
 
 
-def _by_record(fit: Any) -> str:
+def _by_record(fit: "Fit") -> str:
     """Chart of the root mean square of the residuals of every record: it shows which of them do not fit."""
     joined = [np.concatenate([column.ravel() for column in record.values()]) for record in fit.residuals]
     size = np.array([np.sqrt(np.nanmean(r**2)) if np.isfinite(r).any() else np.nan for r in joined])
@@ -125,7 +128,7 @@ def _by_record(fit: Any) -> str:
     return chart("Root mean square of each record", "record", "[standard deviations]", [curve], margin=0.02)
 
 
-def _search(fit: Any, found: Sequence[Profile]) -> Section:
+def _search(fit: "Fit", found: Sequence[Profile]) -> Section:
     names = number_names(fit.problem)
     charts = [_costs(fit)] if len(fit.costs) > 1 else []
     if len(names) > 1:
@@ -135,7 +138,7 @@ def _search(fit: Any, found: Sequence[Profile]) -> Section:
     return Section(title="How well it is found", charts=charts)
 
 
-def _costs(fit: Any) -> str:
+def _costs(fit: "Fit") -> str:
     """Chart of the cost at which every start ended, the lowest first, coloured by the order of impacts."""
     over = np.round(np.log10(fit.costs / max(fit.costs[0], 1e-300)), 3)
     groups = [np.array(members) for members in alike(fit.orders)]
@@ -156,7 +159,7 @@ def profile_chart(found: Profile) -> str:
     return chart(f"Profile of {found.name}{words}", found.name, "rise of the cost", curves, events=ends)
 
 
-def _origin(fit: Any) -> Section:
+def _origin(fit: "Fit") -> Section:
     made = fit.summary
     versions = ", ".join(f"{name} {value}" for name, value in made.versions.items())
     many = f" in {len(fit.scenes)} records" if len(fit.scenes) > 1 else ""
