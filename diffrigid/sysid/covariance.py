@@ -134,18 +134,6 @@ def _told_by_one(H: list[np.ndarray], root: np.ndarray) -> np.ndarray:
     return out
 
 
-def student_quantile(freedom: float, probability: float = 0.975) -> float:
-    """Quantile of Student's t. With t = sqrt(nu) tan(u), the density of u is proportional to cos(u)^(nu - 1)."""
-    if freedom > 1000:
-        return 1.959964 if probability == 0.975 else student_quantile(1000.0, probability)
-    u = np.linspace(0.0, np.pi / 2, 200001)[:-1]
-    density = np.cos(u) ** (freedom - 1.0)
-    half = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
-    if freedom < 2:  # the density does not end at zero: cos^0, all of it belongs to the total
-        half = half / (half[-1] + 0.5 * density[-1])
-    return float(np.sqrt(freedom) * np.tan(np.interp(2 * probability - 1, half / half[-1], u)))
-
-
 def _blocks(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Information and score of the shared numbers for each record, with its own numbers eliminated."""
     found = [eliminated(linear, k) for k in range(len(linear.rows))]

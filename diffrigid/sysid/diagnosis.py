@@ -197,7 +197,10 @@ def doubts(series: Sequence[np.ndarray], expected: float | None, robust: bool = 
     """
     out = []
     if (p := whiteness(series)) < RARE:
-        out.append(f"residuals follow each other (p = {p:.1g}): the model misses something, intervals are too narrow")
+        out.append(
+            f"residuals follow each other (p = {p:.1g}), so intervals are too narrow: the model misses something, or "
+            "the fit is in a local minimum (compare starts=16, or windows=)"
+        )
     joined = np.concatenate([r[np.isfinite(r)] for r in series])
     if not robust and (p := normality(joined)) < RARE:
         out.append(f"residuals are not normal (p = {p:.1g}): a robust loss, huber() or student(), minds the tails less")

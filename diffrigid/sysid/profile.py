@@ -6,9 +6,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import stdtrit
 
 from diffrigid.step import at_least_one
-from diffrigid.sysid.covariance import student_quantile
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, cost_of, levenberg
 from diffrigid.sysid.result import Fit
@@ -63,7 +63,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> Profile:
         raise ValueError(f"points is {points}: expected an odd number from 3 on, the fitted value in the middle")
     index = _index(fit, name)
     kind: Any = next(slot.kind for slot in fit.problem.shared if slot.name == name)
-    quantile = student_quantile(fit.uncertainty.freedom)
+    quantile = float(stdtrit(fit.uncertainty.freedom, 0.975))
     deviation = float(np.sqrt(fit.covariance[index, index]))
     half = WIDE * quantile * deviation if np.isfinite(deviation) and deviation < 10 else 5.0
     level, most = 0.5 * quantile**2, np.inf if np.isinf(kind.low) else FAR

@@ -9,10 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import stdtrit
 
 from diffrigid.paths import component, unit
 from diffrigid.state import State
-from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance, student_quantile
+from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, own_covariance
 from diffrigid.sysid.diagnosis import (
     Blind,
     blind_directions,
@@ -215,7 +216,7 @@ def describe(
     """Parameters with intervals, and the notes under the table."""
     places = coordinates((*problem.shared, *problem.own), references(problem))
     blind = blind_directions(linear, places)
-    quantile = student_quantile(uncertainty.freedom)
+    quantile = float(stdtrit(uncertainty.freedom, 0.975))
     covariance = infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared))
     parameters = [
         _shared_parameter(problem, slot, shared[rows], uncertainty.covariance[rows, rows], quantile, blind, rows)
