@@ -58,9 +58,8 @@ def apply_impulses(
     together = islands(ends_of(world.joints), moving)
     count, total, evenly = jnp.moveaxis(over_islands(jnp.sum, own, together, 0.0), 1, 0)
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
-    # Displacement per change of velocity [s]: a force that has acted evenly has its centroid in the middle.
-    lever = jnp.where(kick > 0, jnp.where(evenly > 0, 0.5 * (t - flight.t0), 0.0), 1.0)
-    q, mobility, link = _posed(world, flight, t, jnp.where(kick > 0, lever, 0.0))
+    holds = (kick > 0) & (evenly > 0)
+    q, mobility, link = _posed(world, flight, t, jnp.where(holds, 0.5 * (t - flight.t0), 0.0))
     onto = None if link is None else _onto_joints(flight, t, link, (count > 0) & (kick > 0))
     if onto is not None:
         strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
@@ -71,8 +70,9 @@ def apply_impulses(
         P, early_P = P + known.P, early_P + known.early
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     friction = None if known is None else reversing(mobility, strikes, P, (dv, dw), law, held_for)
-    early = velocities(mobility, *momentum_changes(strikes, early_P, moving))
-    moved = lever[:, None] * dv + early[0], lever[:, None] * dw + early[1]
+    # A force that has acted evenly has its centroid in the middle of its time, for which it displaces by P / m.
+    displacing = jnp.where(kick > 0, 0.5 * held_for, 1.0)[:, None] * P + early_P
+    moved = velocities(mobility, *momentum_changes(strikes, displacing, moving))[:2]
     pushed = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
     kept = _no_faster_than_drift(mobility, pushed, strikes) + keeping_spin(
         strikes, drift_after(strikes, dv), early_P, moving
@@ -81,7 +81,7 @@ def apply_impulses(
     if onto is not None:
         kicked = kicked[0] + onto[0], kicked[1] + onto[2]
     # The new path of a body that was held, followed backwards, agrees with its true path to second order.
-    since = jnp.where(count > 0, jnp.where((kick > 0) & (evenly > 0), flight.t0, t), anchors.since)
+    since = jnp.where(count > 0, jnp.where(holds, flight.t0, t), anchors.since)
     return _anchored(flight, t, q, since, kicked, moved), friction, load
 
 

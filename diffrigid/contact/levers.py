@@ -84,20 +84,26 @@ def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tup
     return unfused(live, moved, a, b, poses, rates)
 
 
-def acceleration(side: Side, at: Placed, s: Array, arm: Array, rate: Array | None) -> Array | None:
-    """Mean acceleration of the contact point on this collider from its anchor to s, (D, *batch) [m/s^2]; None: static.
+def acceleration(side: Side, at: Placed, s: Array, arm: Array) -> Array | None:
+    """Mean acceleration, by forces and torques, of a point of this collider from its anchor to s; None: static.
 
-    Args:
-        rate: (D, *batch) [m/s] velocity of the contact point; None: that of the centre.
+    (D, *batch) [m/s^2]. What a spin adds to it is left out.
     """
     f = side.flight
     if f is None:
         return None
     so, half = rotations(f.dim), 0.5 * (s - f.t0)[None]
     a = f.a if f.jolt is None else f.a + half * f.jolt
-    if rate is not None:
-        a = a + so.cross(at.w, rate - at.v)
     if f.tau is None:
         return a
     tau = f.tau if f.twist is None else f.tau + half * f.twist
     return a + so.cross(so.apply(at.inverse_inertia, tau), arm)
+
+
+def coriolis(at: Placed, rate: Array) -> Array:
+    """What the spin of this collider adds to the rate of its velocity where a contact moves along it, (D, *batch).
+
+    Args:
+        rate: (D, *batch) [m/s] velocity of the contact point.
+    """
+    return rotations(len(at.x)).cross(at.w, rate - at.v)

@@ -222,9 +222,11 @@ def _demanded(
     restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
     if world.bodies.restitution_falloff is not None:
         restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
-    stays = comes_to_rest(u, restitution * u, closing_acc, dt[None] - strikes.s, world.contact.rest_speed[None])
+    # Bodies that only a spin brings together again bounce: rest would cost them energy.
+    presses = jnp.minimum(closing_acc, strikes.press)
+    stays = comes_to_rest(u, restitution * u, presses, dt[None] - strikes.s, world.contact.rest_speed[None])
     held, resting = _held(world, strikes, resting, stays, u <= _fallen(world, flight, strikes, closing_acc, dt), phase)
-    began = jnp.maximum(at_colliders(anchors.t0, strikes.a, 0.0), at_colliders(anchors.t0, strikes.b, 0.0))
+    began = jnp.maximum(*(at_colliders(anchors.t0, side, -jnp.inf) for side in (strikes.a, strikes.b)))
     held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
     # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
     may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(strikes.gap, 0.0), held_for), 0.0)

@@ -35,6 +35,7 @@ class Strikes:
     # [m/s] of a against b at the contact point, before the impulse; where gaps are closed (PUSH) the gap along the
     # normal, [m], so that an impulse is [kg m] and changes positions.
     v_rel: Array = array("C", "D")
+    press: Array = array("C")  # [m/s^2] acceleration at which forces close the gap, without what spins do
     pull: Array = array("C", "D")  # [m/s^2] rate of v_rel without impulses; along the normal that of its component
     rests: Array = array("C")  # bool: it touches from the start of the path on
     now: Array = array("C")  # bool: it is the turn of this impact

@@ -57,8 +57,8 @@ def with_rows(
     rows = Strikes(
         active=strikes.active[:count], s=strikes.s[:count], gap=zero, rounding=zero, deepest=zero, normal=along,
         arm_a=none, arm_b=none, mid_a=mid, mid_b=mid, turn=turn, K=_mobility_of_turns(mobility, a, b, so),
-        v_rel=kick * turns(w), pull=turns(pull), drift=none, rests=strikes.rests[:count], now=strikes.now[:count],
-        held=strikes.held[:count],
+        v_rel=kick * turns(w), press=zero, pull=turns(pull), drift=none, rests=strikes.rests[:count],
+        now=strikes.now[:count], held=strikes.held[:count],
     )  # fmt: skip
     strikes = replace(
         jax.tree.map(partial(_behind, count), replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None), rows),

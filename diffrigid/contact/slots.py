@@ -69,7 +69,7 @@ def meet(world: "World", tables: tuple[Table, ...], slots: Slots, anchors: Ancho
     def blow(unpack_b: Callable, columns_a: list, columns_b: list, there: Array) -> Blow:
         (a, own), (b, others) = unpack(columns_a), unpack_b(columns_b)
         strike = jax.vmap(lambda a, b: next_strikes(world, a, b, dt))(a, b)
-        strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, pull=None, drift=None))
+        strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, press=None, pull=None, drift=None))
         return Blow(summed(there) * strike.active.astype(dt.dtype), strike, *law(own, others, strike))
 
     def impulse(blows: list[Blow]) -> tuple:

@@ -174,8 +174,8 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
     return Strikes(
         active=meeting.hit & touches, s=s, gap=open_by, rounding=0.0 * s, deepest=jnp.full_like(s, jnp.inf),
         normal=first, arm_a=none, arm_b=none, K=first[:, None] * first[None] * sum(mobile)[None, None],
-        v_rel=rate[None] * first, pull=pull[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now,
-        held=meeting.held, jac=jac, mid_jac=mid_jac,
+        v_rel=rate[None] * first, press=-pull, pull=pull[None] * first, drift=none, rests=meeting.rests[0],
+        now=meeting.now, held=meeting.held, jac=jac, mid_jac=mid_jac,
     )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """One list of all contacts of a world, whatever the kinds of their shapes, followed by the rows of its joints."""
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix, restitution_at
-from diffrigid.contact.levers import acceleration, levers, with_rates
+from diffrigid.contact.levers import acceleration, coriolis, levers, with_rates
 from diffrigid.contact.order import Links, Meeting, in_order
 from diffrigid.contact.resting import Strikes, are_alone
 from diffrigid.contact.sides import Side, began, centre, contacts_of, place, reach_of, relative_velocity, sides_of
@@ -137,19 +137,29 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
         gap = contact.gap
         lever = levers(replace(contact, gap=jnp.where(held, gap, 0.0)), moving, turns, at_a, at_b, drift, T)
         arms = (a, at_a, lever.arm_a), (b, at_b, lever.arm_b)
-        pulls: list[Any] = [acceleration(side, at, s, arm, lever.rate) for side, at, arm in arms]
-        pull = pulls[0] if pulls[1] is None else -pulls[1] if pulls[0] is None else pulls[0] - pulls[1]
+        forces = _of_a_against_b(*(acceleration(side, at, s, arm) for side, at, arm in arms))
         v_rel = relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b)
-        if turns and moving is not None:  # d(n . v_rel)/dt is of the normal, too
-            pull = pull + dot(moving.normal, v_rel)[None] * contact.normal
+        pull = forces
+        if moving is not None:
+            spins = (None if at.v is None else coriolis(at, lever.rate) for at in (at_a, at_b))
+            pull = pull + _of_a_against_b(*spins)
+            if turns:  # the normal velocity changes as the normal does, too
+                pull = pull + dot(moving.normal, v_rel)[None] * contact.normal
         return Strikes(
             active=gap < 0, s=s, gap=gap, rounding=rounding, deepest=DEEPEST * size, normal=contact.normal,
             arm_a=lever.arm_a, arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
             K=effective_matrix(at_a, at_b, lever), v_rel=v_rel,
-            pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
+            press=-dot(contact.normal, forces), pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip
 
     return replace(jax.vmap(each)(contacts, moving), active=active, rests=meeting.rests)
+
+
+def _of_a_against_b(of_a: Array | None, of_b: Array | None) -> Array:
+    """The difference, where None stands for zero."""
+    if of_a is None or of_b is None:
+        return -of_b if of_a is None else of_a  # type: ignore[operator]
+    return of_a - of_b
 
 
 def relative_path_is_straight(world: "World", both_move: bool) -> bool:
