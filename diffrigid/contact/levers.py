@@ -15,6 +15,7 @@ from jax import Array
 from diffrigid.branches import unfused
 from diffrigid.collide import Contacts
 from diffrigid.contact.sides import Placed, Side, contacts_of
+from diffrigid.flight import Flight
 from diffrigid.numerics import dot, safe_divide
 from diffrigid.pytree import array, pytree
 from diffrigid.state import rotations
@@ -84,14 +85,11 @@ def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tup
     return unfused(live, moved, a, b, poses, rates)
 
 
-def acceleration(side: Side, at: Placed, s: Array, arm: Array) -> Array | None:
-    """Mean acceleration, by forces and torques, of a point of this collider from its anchor to s; None: static.
+def acceleration(f: Flight, at: Placed, s: Array, arm: Array) -> Array:
+    """Mean acceleration, by forces and torques, of a point of a body from its anchor to s, (D, *batch) [m/s^2].
 
-    (D, *batch) [m/s^2]. What a spin adds to it is left out.
+    What a spin adds to it is left out.
     """
-    f = side.flight
-    if f is None:
-        return None
     so, half = rotations(f.dim), 0.5 * (s - f.t0)[None]
     a = f.a if f.jolt is None else f.a + half * f.jolt
     if f.tau is None:
@@ -101,7 +99,7 @@ def acceleration(side: Side, at: Placed, s: Array, arm: Array) -> Array | None:
 
 
 def coriolis(at: Placed, rate: Array) -> Array:
-    """What the spin of this collider adds to the rate of its velocity where a contact moves along it, (D, *batch).
+    """What a spin adds to the rate of a body's velocity where a contact moves along it, (D, *batch) [m/s^2].
 
     Args:
         rate: (D, *batch) [m/s] velocity of the contact point.

@@ -72,7 +72,7 @@ class Found(NamedTuple):
 def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Found:
     clear, no = clearance(task), start < start
 
-    def safe(s, dt):  # the step is over long before anything closes
+    def safe(s, dt):  # the step is over long before anything closes: the normal of a half-space does not turn
         return dt >= 2.0 * (task.t1 - s)
 
     def flying(carry):

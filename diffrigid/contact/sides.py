@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -133,7 +134,7 @@ def _origin(side: Side, at: Placed) -> tuple[Array, Array]:
 def relative_velocity(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
     """Velocity of a against b at these arms from their centres of mass, (D, *batch) [m/s]."""
     cross = rotations(arm_a.shape[0]).cross
-    return _difference(lambda at, arm: at.v + cross(at.w, arm), at_a, arm_a, at_b, arm_b)
+    return difference(lambda at, arm: at.v + cross(at.w, arm), at_a, arm_a, at_b, arm_b)
 
 
 def relative_acceleration(at_a: Placed, at_b: Placed, point_a: Array, point_b: Array) -> Array:
@@ -146,13 +147,14 @@ def relative_acceleration(at_a: Placed, at_b: Placed, point_a: Array, point_b: A
         cross = rotations(arm.shape[0]).cross
         return at.a + cross(at.dw, arm) + cross(at.w, cross(at.w, arm))
 
-    return _difference(one, at_a, point_a - at_a.x, at_b, point_b - at_b.x)
+    return difference(one, at_a, point_a - at_a.x, at_b, point_b - at_b.x)
 
 
-def _difference(of, at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
+def difference(of: Callable, at_a: Placed, given_a: Any, at_b: Placed, given_b: Any) -> Array:
+    """of(at_a, given_a) - of(at_b, given_b), without the term of a static."""
     if at_b.v is None:
-        return of(at_a, arm_a)
-    return -of(at_b, arm_b) if at_a.v is None else of(at_a, arm_a) - of(at_b, arm_b)
+        return of(at_a, given_a)
+    return -of(at_b, given_b) if at_a.v is None else of(at_a, given_a) - of(at_b, given_b)
 
 
 @jax.jit

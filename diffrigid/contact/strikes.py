@@ -17,7 +17,17 @@ from diffrigid.contact.impulse import effective_matrix, restitution_at
 from diffrigid.contact.levers import acceleration, coriolis, levers, with_rates
 from diffrigid.contact.order import Links, Meeting, in_order
 from diffrigid.contact.resting import Strikes, are_alone
-from diffrigid.contact.sides import Side, began, centre, contacts_of, place, reach_of, relative_velocity, sides_of
+from diffrigid.contact.sides import (
+    Side,
+    began,
+    centre,
+    contacts_of,
+    difference,
+    place,
+    reach_of,
+    relative_velocity,
+    sides_of,
+)
 from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
@@ -136,13 +146,12 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     def each(contact: Contacts, moving: Contacts | None) -> Strikes:
         gap = contact.gap
         lever = levers(replace(contact, gap=jnp.where(held, gap, 0.0)), moving, turns, at_a, at_b, drift, T)
-        arms = (a, at_a, lever.arm_a), (b, at_b, lever.arm_b)
-        forces = _of_a_against_b(*(acceleration(side, at, s, arm) for side, at, arm in arms))
+        sides = at_a, (a.flight, lever.arm_a), at_b, (b.flight, lever.arm_b)
+        forces = difference(lambda at, of: acceleration(of[0], at, s, of[1]), *sides)
         v_rel = relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b)
         pull = forces
         if moving is not None:
-            spins = (None if at.v is None else coriolis(at, lever.rate) for at in (at_a, at_b))
-            pull = pull + _of_a_against_b(*spins)
+            pull = pull + difference(coriolis, at_a, lever.rate, at_b, lever.rate)
             if turns:  # the normal velocity changes as the normal does, too
                 pull = pull + dot(moving.normal, v_rel)[None] * contact.normal
         return Strikes(
@@ -153,13 +162,6 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
         )  # fmt: skip
 
     return replace(jax.vmap(each)(contacts, moving), active=active, rests=meeting.rests)
-
-
-def _of_a_against_b(of_a: Array | None, of_b: Array | None) -> Array:
-    """The difference, where None stands for zero."""
-    if of_a is None or of_b is None:
-        return -of_b if of_a is None else of_a  # type: ignore[operator]
-    return of_a - of_b
 
 
 def relative_path_is_straight(world: "World", both_move: bool) -> bool:
