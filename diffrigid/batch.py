@@ -1,8 +1,9 @@
 """Many worlds at once: the only place where the batch axis moves.
 
-Inside, the batch is the last axis, because on a CPU XLA vectorises the innermost one, and a batch runs in
-chunks whose temporaries stay in the cache, divided among the devices. Outside, the JAX convention holds: a leading
-batch axis. Plain `jax.vmap(rollout)` gives the same numbers; its batch axis comes first, in one chunk on one device.
+Inside, the batch is the last axis, because on a CPU XLA vectorises the innermost one, and a batch runs in chunks whose
+temporaries stay in the cache (of a GPU: fit its memory), divided among the devices. Outside, the JAX convention holds:
+a leading batch axis. Plain `jax.vmap(rollout)` gives the same numbers; its batch axis comes first, in one chunk on one
+device.
 """
 
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ from jax import lax
 from diffrigid.compiling import is_for_speed, uncollected
 from diffrigid.controls import as_controls, controlled
 from diffrigid.convert import numbers
-from diffrigid.devices import cut, devices, join, over_devices, pieces_of
+from diffrigid.devices import cut, devices, join, on_cpu, over_devices, pieces_of
 from diffrigid.pytree import map_arrays
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State
@@ -33,12 +34,12 @@ from diffrigid.step import (
 )
 from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
-LANES = 2**15  # of a chunk: one for each contact, or more, and four for each body of its worlds
+LANES, LANES_GPU = 2**15, 2**23  # of a chunk: one for each contact, or more, and four for each body of its worlds
 # Lanes of a contact of shapes with corners, which needs a search and is rarely alone; least and most worlds of a chunk.
 # Compiled for speed, small chunks cost no more calls, and what one world needs is computed for fewer others.
-CORNER, CORNER_FOR_SPEED = 32, 512
+CORNER, CORNER_FOR_SPEED, CORNER_GPU = 32, 512, 8
 LEAST, LEAST_FOR_SPEED = 2**5, 2**4
-MOST, MOST_FOR_SPEED = 2**12, 2**6
+MOST, MOST_FOR_SPEED, MOST_GPU = 2**12, 2**6, 2**20
 
 
 @uncollected
@@ -130,8 +131,11 @@ def _batch_sizes(tree) -> list[int]:
 
 def _chunk(world: World) -> int:
     """Number of worlds of a chunk, a power of two, whose contacts and bodies fill LANES."""
-    fast = is_for_speed()
-    corner, least, most = (CORNER_FOR_SPEED, LEAST_FOR_SPEED, MOST_FOR_SPEED) if fast else (CORNER, LEAST, MOST)
+    full, corner, least, most = LANES, CORNER, LEAST, MOST
+    if not on_cpu():
+        full, corner, most = LANES_GPU, CORNER_GPU, MOST_GPU
+    elif is_for_speed():
+        corner, least, most = CORNER_FOR_SPEED, LEAST_FOR_SPEED, MOST_FOR_SPEED
 
     def lanes(pairs):
         rounds = all(
@@ -140,7 +144,7 @@ def _chunk(world: World) -> int:
         return len(pairs.a) * pairs.count * (1 if rounds else corner)
 
     contacts = sum(map(lanes, world.pairs))
-    filling = 2 ** np.round(np.log2(LANES / (contacts + 4 * len(world.names))))
+    filling = 2 ** np.round(np.log2(full / (contacts + 4 * len(world.names))))
     return int(np.clip(filling, 1 if world.crowd else least, most))  # a crowd is wide enough by itself
 
 

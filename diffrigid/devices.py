@@ -22,6 +22,11 @@ def devices() -> list[jax.Device]:
     return [chosen] if isinstance(chosen, jax.Device) else jax.devices(chosen)
 
 
+def on_cpu() -> bool:
+    """Whether the devices that do the work are CPUs."""
+    return devices()[0].platform == "cpu"
+
+
 def over_devices(fn: Callable, parts: Any, whole: Any) -> Any:
     """Evaluate fn(parts, whole), each device on its share.
 

@@ -15,6 +15,10 @@ from diffrigid.numerics import safe_divide
 TINY = 6  # rows of a matrix, up to which its elimination is unrolled
 SMALL = 9  # rows of a matrix, up to which a whole batch at once is faster than a library that takes one by one
 
+# Else a GPU rounds factors in single precision to ten bits.
+matmul = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
+einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
+
 
 def solve_regular(matrix: Array, right: Array) -> Array:
     """Solve matrix x = right for x, with regular matrices, (R, R, *batch), (R, *batch) -> (R, *batch).
@@ -39,9 +43,12 @@ def _eliminated(matrix: Array, right: Array) -> Array:
         return _gauss(system)
     # Not fused, for else all that the matrix is made of is computed in the order of the transposed one.
     system = unfused(opaque_true(right), lambda system: system, system)
-    # What elimination makes of the right side beside the matrix needs no permutation.
-    upper, reduced = jnp.split(lax.linalg.lu(jnp.moveaxis(system, (0, 1), (-2, -1)))[0], [len(matrix)], axis=-1)
-    x = lax.linalg.triangular_solve(upper, reduced, left_side=True)[..., 0]
+    # What elimination makes of the right side beside the matrix needs no permutation. With a row below the system is
+    # square: libraries for GPUs take a batch of these at once, others one by one.
+    count = len(matrix)
+    square = jnp.concatenate([system, jnp.zeros_like(system[:1])])
+    factors = lax.linalg.lu(jnp.moveaxis(square, (0, 1), (-2, -1)))[0][..., :count, :]
+    x = lax.linalg.triangular_solve(factors[..., :count], factors[..., count:], left_side=True)[..., 0]
     return jnp.moveaxis(jnp.where(jnp.isfinite(x), x, 0.0), -1, 0)
 
 

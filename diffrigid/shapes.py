@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid.hull import apexes, hull_edges, hull_faces, triples
+from diffrigid.linear import einsum, matmul
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 
 _BALL = (1.0, 2.0, math.pi, 4 * math.pi / 3)  # volume of the unit ball by dimension
@@ -321,8 +322,8 @@ def _solid_moments(corners, faces):
     a = corners[faces] - inner[None, None]
     det, total = jnp.linalg.det(a), a.sum(1)
     volume = det.sum() / math.factorial(dim)
-    offset = det @ total / math.factorial(dim + 1) / volume
-    squares = jnp.einsum("f,fci,fcj->ij", det, a, a) + jnp.einsum("f,fi,fj->ij", det, total, total)
+    offset = matmul(det, total) / math.factorial(dim + 1) / volume
+    squares = einsum("f,fci,fcj->ij", det, a, a) + einsum("f,fi,fj->ij", det, total, total)
     second = squares / math.factorial(dim + 2) / volume - jnp.outer(offset, offset)
     return volume, inner + offset, second
 

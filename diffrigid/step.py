@@ -16,6 +16,7 @@ from diffrigid.contact.crowd import without_room
 from diffrigid.contact.strikes import ends, is_rolling
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, largest, numbers
+from diffrigid.devices import on_cpu
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import FOUND, PASSED, saving, with_tangents
@@ -254,7 +255,7 @@ def options_for(inputs: tuple, steps: int, worlds: int) -> int:
         inputs: arguments of the program, a world first.
     """
     world = inputs[0]
-    if world.crowd or is_for_speed() or jax.default_backend() != "cpu" or traced(inputs) or not is_own_program():
+    if world.crowd or is_for_speed() or not on_cpu() or traced(inputs) or not is_own_program():
         return OPTIONS.index(None)
     return (worlds > 1) + (steps * worlds * work(world) > MUCH)
 
@@ -301,7 +302,7 @@ def final_state(world: World, state: State, dt: Array, controls: Any, steps: int
 
 
 def fenced(world: World, saves: bool):
-    """`advance`, which reverse mode recomputes from the state, behind a `lax.cond` that is always true.
+    """`advance`, which reverse mode recomputes from the state; on a CPU behind a `lax.cond` that is always true.
 
     If it `saves` what the passes of a step find and hand on, each pass is recomputed from that.
 
@@ -317,6 +318,8 @@ def fenced(world: World, saves: bool):
         def stepped(state):
             return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
 
+        if not on_cpu():
+            return stepped(state)
         return lax.cond(opaque_true(dt), stepped, lambda state: state, state)
 
     return one_step

@@ -12,8 +12,9 @@ from bench_native import coordinates, is_flat, mjcf, read_mujoco
 def starts(scenes, free):
     """qpos and qvel of all worlds."""
     import jax.numpy as jnp
+    import numpy as np
 
-    return [jnp.array(part, jnp.float32) for part in zip(*(coordinates(s, free) for s in scenes), strict=True)]
+    return [jnp.array(np.array(part, np.float32)) for part in zip(*(coordinates(s, free) for s in scenes), strict=True)]
 
 
 def mjx(scenes):

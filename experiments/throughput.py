@@ -1,15 +1,15 @@
 """How many world-steps a second does one core reach beside nine other engines, and what does a gradient cost?
 
     python experiments/throughput.py [--scenes S1,S2] [--forward] [--plain] [--runs 5] [--out FILE] [--core N]
-        [--cpu] [--figure FILE] [--measured]
+        [--cpu] [--gpu] [--figure FILE] [--measured]
 
-One core; each case in a process of its own, so that compile time and peak memory are its own. A world-step is
-one step of one world, whatever its sub-steps. The native engines step their worlds in turn, from Python or, MuJoCo,
-by its rollout; diffrigid, MJX, Brax and Jax2D step a batch in one call, compiled apart, all of them as
-`dr.compile_for_speed` has it unless `--plain`. Batches of the peers grow as long as that is a gain. pymunk, Bullet and
-MuJoCo compute in float64, the others in float32. The gradient is `value_and_grad` of the sum of squared final positions
-with respect to all initial velocities; its memory is that of the temporaries of the compiled program. Peaks of the
-process, in the JSON, hold the compiler too. Figures are medians.
+One core, or with --gpu one GPU, S1 to S5, and only the engines in JAX, in large batches; each case in a process of its
+own, so that compile time and peak memory are its own. A world-step is one step of one world, whatever its sub-steps.
+The native engines step their worlds in turn, from Python or, MuJoCo, by its rollout; diffrigid, MJX, Brax and Jax2D
+step a batch in one call, compiled apart, all of them as `dr.compile_for_speed` has it unless `--plain`. Batches of the
+peers grow as long as that is a gain. pymunk, Bullet and MuJoCo compute in float64, the others in float32. The gradient
+is `value_and_grad` of the sum of squared final positions with respect to all initial velocities; its memory is that of
+the temporaries of the compiled program. Peaks of the process, in the JSON, hold the compiler too. Figures are medians.
 
 An engine counts as a peer of a scene where its bodies end as they should: `check` of the scene, "ok" in the line.
 pymunk, Box2D and MuJoCo are in the extra `experiments`; of these, what is not installed is left out:
@@ -42,6 +42,8 @@ MAX_SECONDS = 900  # of a case
 MAX_RUN = 30.0  # [s] that a larger batch may take at the rate of the one before
 PEER_WORLDS, PEER_BODIES = 32, 1024  # worlds in a timed run, but no more than so many bodies; Box2D holds 128 worlds
 BATCHES = (1, 64, 1024)  # of the batched peers, as long as the rate grows
+GPU_BATCHES = (2**14, 2**16)
+GPU_WORLDS = {"S1": 2**18, "S2": 2**16, "S3": 2**13, "S4": 2**17, "S5": 2**17}  # of diffrigid
 CLOCKS = {False: time.perf_counter, True: time.process_time}
 LONG = ("S3", "S4")  # their gradients take many minutes to compile
 PACKAGES = {peer.package for peer in PEERS.values()} | {"diffrigid", "jax", "jaxlib", "numpy"}
@@ -78,13 +80,14 @@ def batched_rate(scenes, case):
 def diffrigid_rate(scenes, case):
     import jax
     import jax.numpy as jnp
+    import numpy as np
 
     import diffrigid as dr
 
     if not case["plain"]:
         dr.compile_for_speed()
     world, state = build_diffrigid(scenes[0])
-    x, v = (jnp.array([getattr(s, key) for s in scenes], jnp.float32) for key in "xv")
+    x, v = (jnp.array(np.array([getattr(s, key) for s in scenes], np.float32)) for key in "xv")
     states = replace(jax.tree.map(lambda leaf: jnp.repeat(leaf[None], len(scenes), axis=0), state), x=x)
 
     def roll(v, world, states):
@@ -139,6 +142,8 @@ def run_in_process(case):
     if case["engine"] in PEERS and PEERS[case["engine"]].package not in VERSIONS:
         return case | {"error": "not installed"}
     env = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_X64": "0", "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    if case["gpu"]:
+        env["JAX_PLATFORMS"] = "cuda,cpu"
     env["JAX_TRACEBACK_FILTERING"] = "off"  # else an error does not come last
     command = [sys.executable, __file__, "--case", json.dumps(case)]
     try:
@@ -154,6 +159,8 @@ def measure(name, **options):
     scene, rows, best = SCENES[name](0), [], {}  # rates of the best native and the best batched peer
     few = min(PEER_WORLDS, -(-PEER_BODIES // len(scene.x)))
     batches = {"native": (few,), "batched": BATCHES, "diffrigid": scene.worlds}
+    if options["gpu"]:
+        batches = {"native": (), "batched": GPU_BATCHES, "diffrigid": (GPU_WORLDS[name],)}
     for engine in [*peers_of(scene), "diffrigid"]:
         of, last = kind(engine), 0.0
         for worlds in batches[of]:
@@ -187,6 +194,7 @@ def main():
     parser.add_argument("--forward", action="store_true", help="no gradients")
     parser.add_argument("--plain", action="store_true", help="without `dr.compile_for_speed`")
     parser.add_argument("--cpu", action="store_true", help="CPU time, where other work shares the core")
+    parser.add_argument("--gpu", action="store_true", help="on the GPU")
     parser.add_argument("--runs", type=int, default=5, help="the least in a median")
     parser.add_argument("--core", type=int, help="core to pin to; the last one unless told")
     parser.add_argument("--figure", type=Path, help="draw the rates to this file")
@@ -195,7 +203,9 @@ def main():
     args = parser.parse_args()
     if args.case:
         return print(json.dumps(run_case(args.case)))
-    if hasattr(os, "sched_setaffinity"):  # before jax is imported: XLA's thread pool has as many threads
+    if args.gpu:
+        args.plain, args.scenes = True, ",".join(name for name in args.scenes.split(",") if name in GPU_WORLDS)
+    elif hasattr(os, "sched_setaffinity"):  # before jax is imported: XLA's thread pool has as many threads
         args.core = max(os.sched_getaffinity(0)) if args.core is None else args.core
         os.sched_setaffinity(0, {args.core})
     print(HEADER)
@@ -205,7 +215,8 @@ def main():
         return report(rows, args.figure)
     rows = []
     for name in args.scenes.split(","):
-        rows += measure(name, forward=args.forward or name in LONG, plain=args.plain, runs=args.runs, cpu=args.cpu)
+        forward = args.forward or name in LONG
+        rows += measure(name, forward=forward, plain=args.plain, runs=args.runs, cpu=args.cpu, gpu=args.gpu)
         args.out.write_text(
             json.dumps(machine() | {"core": args.core, "cpu_time": args.cpu, "cases": rows}, indent=1) + "\n"
         )

@@ -25,6 +25,7 @@ from jax import Array
 
 from diffrigid import so2, so3
 from diffrigid.convert import coefficient, known_number, numbers
+from diffrigid.linear import matmul
 
 NEAR_BOUND = 1e-3  # [-] of an interval: a start on a bound is pulled off it, a result this close is reported
 PULL = 1e-3  # a start on the bound of a positive parameter begins this far above it, in its unit
@@ -114,7 +115,7 @@ class Chart:
 
     def log_volume(self, z: Array, reference: Array) -> Array:
         slopes = jax.jacfwd(self.map)(z, reference).reshape(-1, z.shape[0])
-        return 0.5 * jnp.linalg.slogdet(slopes.T @ slopes)[1]
+        return 0.5 * jnp.linalg.slogdet(matmul(slopes.T, slopes))[1]
 
     def at_bound(self, value: np.ndarray) -> bool:
         return False
@@ -311,7 +312,7 @@ def _inertia_of(moments: Array) -> Array:
 def _principal_moments(z: Array, reference: Array) -> Array:
     """Inertia with the second moments S along their principal axes scaled, each by exp(z)."""
     sizes, axes = jnp.linalg.eigh(_second_moments(reference))
-    return _inertia_of((axes * (sizes * jnp.exp(z))[None]) @ axes.T)
+    return _inertia_of(matmul(axes * (sizes * jnp.exp(z))[None], axes.T))
 
 
 def _physical_inertia(z: Array, reference: Array) -> Array:
@@ -325,8 +326,8 @@ def _physical_inertia(z: Array, reference: Array) -> Array:
     factor = jnp.stack(
         [jnp.stack(row) for row in ([scale[0], zero, zero], [z[3], scale[1], zero], [z[4], z[5], scale[2]])]
     )
-    half = jnp.linalg.cholesky(_second_moments(reference)) @ factor
-    return _inertia_of(half @ half.T)
+    half = matmul(jnp.linalg.cholesky(_second_moments(reference)), factor)
+    return _inertia_of(matmul(half, half.T))
 
 
 def _shares_size(shape: tuple[int, ...]) -> int:

@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid.compiling import QUICK
+from diffrigid.linear import einsum
 from diffrigid.sysid.problem import Group, linearise
 
 FAINT = 1e-2  # [-] of the largest slope: a number with a smaller slope is damped as if it had this one
@@ -109,8 +110,8 @@ def arrow(loss: Any, point: Point, members: tuple[tuple[int, ...], ...]) -> Arro
         ok = jnp.isfinite(jac).all((0, 1)) & jnp.isfinite(r).all(0)
         r, jac = _choose(ok, r, jnp.zeros_like(r)), _choose(ok, jac, jnp.zeros_like(jac))
         weighted = jac * loss.weight(r)[:, None]
-        rows.append(jnp.einsum("mirs,mjrs->rsij", weighted, jac))
-        pulls.append(jnp.einsum("mirs,mrs->rsi", weighted, r))
+        rows.append(einsum("mirs,mjrs->rsij", weighted, jac))
+        pulls.append(einsum("mirs,mrs->rsi", weighted, r))
     H, g = (jnp.swapaxes(_in_order(members, parts), 0, 1) for parts in (rows, pulls))
     return Arrow(H[..., :a, :a].sum(1), H[..., :a, a:], H[..., a:, a:], g[..., :a].sum(1), g[..., a:])
 
@@ -121,7 +122,7 @@ def eliminate(eq: Arrow) -> tuple[Array, Array, Array]:
         return eq.A, eq.g, jnp.zeros((*eq.h.shape[:2], 0, eq.g.shape[-1] + 1), eq.g.dtype)
     right = jnp.concatenate([jnp.swapaxes(eq.B, -1, -2), eq.h[..., None]], axis=-1)
     solved = jnp.linalg.solve(eq.D, right)
-    taken = jnp.einsum("srab,srbc->sac", eq.B, solved)
+    taken = einsum("srab,srbc->sac", eq.B, solved)
     return eq.A - taken[..., :-1], eq.g - taken[..., -1], solved
 
 
@@ -130,7 +131,7 @@ def solve(eq: Arrow) -> tuple[Array, Array]:
     matrix, right, solved = eliminate(eq)
     a = eq.g.shape[-1]
     shared = -jnp.linalg.solve(matrix, right[..., None])[..., 0] if a else right
-    own = -solved[..., -1] - jnp.einsum("srba,sa->srb", solved[..., :-1], shared)
+    own = -solved[..., -1] - einsum("srba,sa->srb", solved[..., :-1], shared)
     return shared, own
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid.compiling import LASTING, QUICK, uncollected
-from diffrigid.devices import cut, devices, everywhere, join, over_devices, pieces_of
+from diffrigid.devices import cut, devices, everywhere, join, on_cpu, over_devices, pieces_of
 from diffrigid.pytree import replace
 from diffrigid.state import State
 from diffrigid.step import aligned, scan_steps, work
@@ -271,7 +271,7 @@ def evaluate(plan: Plan, z: Array, data: Data) -> Array:
 
 def _is_much(z: Array, data: Data) -> bool:
     """Whether the simulation in the directions of all z takes longer than its compilation, or is for a GPU."""
-    return jax.default_backend() != "cpu" or z.size * len(data.lengths) * work(data.scene.world) > LITTLE
+    return not on_cpu() or z.size * len(data.lengths) * work(data.scene.world) > LITTLE
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:
