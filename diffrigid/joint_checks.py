@@ -164,7 +164,7 @@ def warn_of_torn_joints(world: "World", state: State) -> None:
         if speed > TYPED:
             warnings.warn(
                 f"{name}: velocities at the start do not fit, the joint comes apart at {speed:.3g} m/s or rad/s; the "
-                "first step begins with the impulse that mends it. Give the bodies v and w that fit.",
+                "motion begins with the impulse that mends it. Give the bodies v and w that fit.",
                 stacklevel=3,
             )
 

@@ -135,7 +135,7 @@ def scene(
         ValueError: names the argument, what was expected, and the fix. Traced values are not checked.
 
     Warns:
-        UserWarning: bodies that overlap at the start, and velocities that do not fit the joints: the first step
+        UserWarning: bodies that overlap at the start, and velocities that do not fit the joints: the motion
             then begins with the impulse that makes them fit.
 
     Example:

@@ -65,6 +65,9 @@ def rollout(
 ) -> Trajectory:  # fmt: skip
     """Trajectory from `state`, at every step or at given times.
 
+    Where joints do not hold in `state`, the bodies are moved onto them first, and struck by the impulses that make their
+    velocities fit.
+
     Args:
         dt: [s] length of a step, or with `times` the longest step allowed.
         steps: number of steps T >= 1; or
@@ -203,8 +206,12 @@ def advance(world: World, state: State, dt: Array, controls: Any) -> State:
     def launch_from(state: State, t0: Array) -> Flight:
         return launch(world, state, controls, t0, dt)
 
-    end = world.contact(world, state, launch_from, dt)
-    return onto_joints(world.joints, world.statics, world.bodies, end) if world.joints else end
+    return joined(world, world.contact(world, state, launch_from, dt))
+
+
+def joined(world: World, state: State) -> State:
+    """Bring poses and velocities onto the joints: a start as it was given, and the end of a step."""
+    return onto_joints(world.joints, world.statics, world.bodies, state) if world.joints else state
 
 
 def aligned(world: World, state: State) -> tuple[World, State]:
@@ -231,7 +238,7 @@ def _missed_jit(world, states, dt):
 
 def _step(world, state, dt, controls):
     world, state = aligned(world, state)
-    return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
+    return advance(world, joined(world, state), jnp.broadcast_to(dt, state.x.shape[2:]), controls)
 
 
 def _rollout(world, state, intervals, controls, counts, memory):
@@ -282,8 +289,9 @@ def scan_steps(
         state = one_step(state, *inputs)
         return state, state
 
-    block, start = _block_length(state, len(owner), memory), with_tangents(state, (world, intervals, controls))
-    _, states = _blocked_scan(record, start, (lengths, controls), len(owner), block)
+    state = joined(world, with_tangents(state, (world, intervals, controls)))
+    block = _block_length(state, len(owner), memory)
+    _, states = _blocked_scan(record, state, (lengths, controls), len(owner), block)
     ends = np.cumsum(counts) - 1
     if len(owner) != len(counts):
         states = jax.tree.map(lambda leaf: leaf[ends], states)
@@ -297,7 +305,7 @@ def final_state(world: World, state: State, dt: Array, controls: Any, steps: int
     def record(state, inputs):
         return one_step(state, *inputs), None
 
-    state, lengths = with_tangents(state, (world, dt, controls)), jnp.full((steps,), dt)
+    state, lengths = joined(world, with_tangents(state, (world, dt, controls))), jnp.full((steps,), dt)
     return _blocked_scan(record, state, (lengths, controls), steps, _block_length(state, steps, memory))[0]
 
 
