@@ -65,8 +65,8 @@ def rollout(
 ) -> Trajectory:  # fmt: skip
     """Trajectory from `state`, at every step or at given times.
 
-    Where joints do not hold in `state`, the bodies are moved onto them first, and struck by the impulses that make their
-    velocities fit.
+    Where joints do not hold in `state`, the bodies are moved onto them first, and struck by the impulses that make
+    their velocities fit.
 
     Args:
         dt: [s] length of a step, or with `times` the longest step allowed.

@@ -72,7 +72,7 @@ def _torn(scene: Scene) -> list[str]:
         for name in names
     ]
     return [
-        f"the fitted start is {size:.2g} m (or rad) off the joint {name}, onto which the bodies are moved before all else: "
+        f"the fitted start is {size:.2g} m (or rad) off the joint {name}, onto which bodies are moved before all else: "
         "free what moves with it too, a position with an angle, anchor_b with anchor_a" + (f", or {own}" if own else "")
         for (name, own), size in zip(joints, np.abs(errors).max(1), strict=True)
         if size > TORN
