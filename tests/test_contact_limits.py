@@ -360,3 +360,15 @@ def test_what_tumbles_on_a_box_does_so_as_on_a_half_space():
         paths.append(dr.rollout(*scene, dt=1 / 60, steps=90).state)
     jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-10), *paths)
     assert abs(paths[0].q[-1, 0, 1] - paths[0].q[0, 0, 1]) > 0.1
+
+
+def test_in_single_precision_too_one_corner_strikes_after_the_other():
+    """A box that lands 1e-4 rad from flat: its second corner is 0.1 mm up when the first strikes."""
+    box = dr.Body(dr.Box(half=(0.5, 0.35)), mass=1.0, x=(0.0, 0.3501), angle=1e-4, v=(0.3, -1.0))
+    floor = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+    double = dr.scene({"box": box, "floor": floor}, restitution=0.5, friction=0.3)
+    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), double)
+    exact, rounded = (dr.rollout(*scene, dt=1 / 60, steps=1).state for scene in (double, single))
+    assert abs(exact.w[-1, 0, 0]) > 0.5  # at once they would not turn it
+    assert_allclose(rounded.w[-1], exact.w[-1], atol=1e-3)
+    assert_allclose(rounded.v[-1], exact.v[-1], atol=1e-3)

@@ -28,13 +28,17 @@ from diffrigid.contact.sides import (
     contacts_of,
     earliest,
     gap_rates,
+    gap_rounding,
     moving_along,
     place,
     reach_of,
+    smaller_size,
 )
 from diffrigid.numerics import FOUND, dot, implicit_root, norm, normalise, safe_divide, safe_sqrt, softplus
 from diffrigid.shapes import Disc, HalfSpace, Profile, Shape, Sphere
 from diffrigid.state import rotations
+
+AT_ONCE = 1e-8  # [-] of the smaller size: contacts whose gaps differ by no more, or by their rounding, strike at once
 
 
 def find_impact(
@@ -61,8 +65,8 @@ def find_impact(
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     s0, hit = checkpoint_name((s0, hit), FOUND)
-    slack = jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.minimum(reach_of(a), reach_of(b))
     at_a, at_b = place(a, s0, live), place(b, s0, live)
+    slack = jnp.maximum(AT_ONCE * smaller_size(a, b), gap_rounding(a, at_a, b, at_b))
     moved = contacts_of(a, at_a, b, at_b)
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
     closes = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]

@@ -30,7 +30,7 @@ class Meeting:
     fast: Array = array()  # bool: an impact that is not slow
     rests: Array = array("K")  # bool, of each contact: it touches from the start of the path on
     level: Any = array(default=None)  # [m] gap at which they meet
-    slack: Any = array(default=None)  # [m] within which contacts are simultaneous, sqrt(rounding) of the smaller size
+    slack: Any = array(default=None)  # [m] contacts whose gaps differ by no more are simultaneous
     now: Any = array(default=None)  # bool: this impact is handled in this pass
     joins: Any = array(default=None)  # bool: the resting contacts take part in an impact of this pass
     held: Any = array(default=None)  # bool: s is the time until which the resting contacts are held

@@ -25,6 +25,8 @@ from diffrigid.state import rotations
 if TYPE_CHECKING:
     from diffrigid.world import World
 
+ROUNDING = 1e2  # [-] times eps times (size + a tenth of the coordinates): accuracy to which gaps are known
+
 
 @pytree
 class Side:
@@ -197,6 +199,17 @@ def reach_of(side: Side) -> Array:
     shape, offset = lax.stop_gradient((side.shape, side.offset))
     dim = side.x.shape[0] if side.flight is None else side.flight.dim
     return reach(shape, dim) if offset is None else reach(shape, dim) + norm(offset)
+
+
+def smaller_size(a: Side, b: Side) -> Array:
+    """The smaller reach of two colliders, (*batch) [m]."""
+    return lax.stop_gradient(jnp.minimum(reach_of(a), reach_of(b)))
+
+
+def gap_rounding(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Array:
+    """Accuracy to which gaps between two colliders are known, (*batch) [m]."""
+    far = smaller_size(a, b) + 0.1 * lax.stop_gradient(jnp.abs(at_a.x).max(0) + jnp.abs(at_b.x).max(0))
+    return ROUNDING * jnp.finfo(far.dtype).eps * far
 
 
 def side_sum(values_a: Array, values_b: Array, a: tuple[int, ...], b: tuple[int, ...], moving: int) -> Array:

@@ -23,10 +23,12 @@ from diffrigid.contact.sides import (
     centre,
     contacts_of,
     difference,
+    gap_rounding,
     place,
     reach_of,
     relative_velocity,
     sides_of,
+    smaller_size,
 )
 from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
 from diffrigid.flight import Flight
@@ -43,7 +45,6 @@ if TYPE_CHECKING:
     from diffrigid.world import World
 
 DEEPEST = 0.2  # [-] of the smaller reach: deeper penetration is resolved in several steps
-ROUNDING = 1e2  # [-] times eps times (size + a tenth of the coordinates): accuracy to which gaps are known
 
 
 def find_strikes(world: "World", flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array) -> Strikes:
@@ -138,9 +139,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     active = (near | (meeting.rests & held[None])) & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
-    size = lax.stop_gradient(jnp.minimum(reach_of(a), reach_of(b)))
-    far = size + 0.1 * lax.stop_gradient(jnp.abs(at_a.x).max(0) + jnp.abs(at_b.x).max(0))
-    rounding = ROUNDING * jnp.finfo(s.dtype).eps * far
+    size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
     T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
 
     def each(contact: Contacts, moving: Contacts | None) -> Strikes:
