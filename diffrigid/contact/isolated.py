@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from diffrigid.branches import any_world, opaque_true, unfused
@@ -67,6 +68,31 @@ def tables_of(world: "World") -> tuple[Table, ...]:
         return Table(pairs, tuple(row_of[i] for i in bodies), tuple(row_of_b[j] for j in b), b, allowed)
 
     return tuple(map(table, world.pairs))
+
+
+def isolated_impacts(
+    world: "World", start: Anchors, launch: Any, dt: Array, sweeps: int
+) -> tuple[Anchors, Array]:
+    """Anchors after passes of isolated impacts, and their number: `sweeps`, unless an impact is left that is none."""
+    tables = tables_of(world)
+
+    def one_pass(now: tuple) -> tuple:
+        anchors, done, _ = now
+        flight = lax.stop_gradient(launch(anchors.state, anchors.t0))
+        following, isolated, needed = next_impacts(world, tables, flight, anchors.since, dt)
+
+        def met(anchors: Anchors) -> Anchors:
+            return meet_in_rounds(world, tables, following, needed, anchors, launch, dt)
+
+        after = lax.cond(isolated, met, lambda anchors: anchors, anchors)
+        count = jnp.where(any_world(needed > 0), done + 1, np.int32(sweeps))
+        return after, jnp.where(isolated, count, done), isolated & (count < sweeps)
+
+    def maybe(now: tuple, _: None) -> tuple:
+        return lax.cond(now[2], one_pass, lambda now: now, now), None
+
+    first = start, jnp.zeros((), np.int32), jnp.asarray(True)
+    return lax.scan(maybe, first, None, length=sweeps)[0][:2]
 
 
 class Next(NamedTuple):

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
@@ -27,7 +28,7 @@ from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.apply import apply_impulses
 from diffrigid.contact.crowd import step_crowd
 from diffrigid.contact.impulse import comes_to_rest, restitution_at
-from diffrigid.contact.isolated import goes_in_rounds, meet_in_rounds, next_impacts, tables_of
+from diffrigid.contact.isolated import goes_in_rounds, isolated_impacts
 from diffrigid.contact.known import Known
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders
@@ -107,42 +108,38 @@ class Contact:
 
     def _passes(self, world: "World", start: Anchors, launch: Callable, dt: Array) -> Anchors:
         """The anchors after all passes."""
+        if not goes_in_rounds(world):
+            return self._any_passes(world, start, None, launch, dt)
+        start, done = isolated_impacts(world, start, launch, dt, self.sweeps)
+        others = functools.partial(self._any_passes, world, launch=launch, dt=dt)
+        return lax.cond(done < self.sweeps, jax.checkpoint(others), lambda start, _: start, start, done)
+
+    def _any_passes(self, world: "World", start: Anchors, done: Array | None, launch: Callable, dt: Array) -> Anchors:
+        """The anchors after passes over all contacts; so many impact passes are `done` already, None: none."""
         always = driven(world)  # acts in every step, without an impact before
         resting = jnp.broadcast_to(flags(always, start.t0), (len(always), *start.t0.shape[1:]))
-
-        tables = tables_of(world) if goes_in_rounds(world) else ()
         # For reverse mode a pass is cheaper to recompute than to save, and compiles faster so, except for its searches
-        # (FOUND). With tables the general pass is rarely needed, and these are not saved: they would mostly be zeros.
-        again = saving(*(FOUND,) * (not tables))
+        # (FOUND). After isolated impacts it is rarely needed, and these are not saved: they would mostly be zeros.
+        again = saving(*(FOUND,) * (done is None))
 
         @again
         def one_pass(now, phase):
             return _pass(world, now, launch, dt, phase)
 
-        @again
-        def isolated_or_any(now, phase):
-            flight = lax.stop_gradient(launch(now.anchors.state, now.anchors.t0))
-            following, isolated, needed = next_impacts(world, tables, flight, now.anchors.since, dt)
-
-            def isolated_pass():
-                after = meet_in_rounds(world, tables, following, needed, now.anchors, launch, dt)
-                return now._replace(anchors=after, found=any_world(needed > 0))
-
-            return lax.cond(isolated & (phase == IMPACT), isolated_pass, lambda: one_pass(now, phase))
-
-        def maybe(now, phase):
-            now = checkpoint_name(now, PASSED)
-            needed = jnp.where(phase == IMPACT, now.found, any_world(now.rests))
+        def maybe(now, following):
+            now, (count, phase) = checkpoint_name(now, PASSED), following
+            impacts = now.found if done is None else now.found & (count >= done)
+            needed = jnp.where(phase == IMPACT, impacts, any_world(now.rests))
             if now.known is not None:
                 needed = jnp.where(phase == REVERSE, any_world(now.known.reverses()), needed)
-            some_pass = isolated_or_any if tables else one_pass
-            return lax.cond(needed, lambda now: some_pass(now, phase), lambda now: now, now), None
+            return lax.cond(needed, lambda now: one_pass(now, phase), lambda now: now, now), None
 
         nothing = jnp.zeros((_rows(world), *start.state.x.shape[1:]), start.t0.dtype)
         known = Known(P=nothing, early=nothing, rubs=nothing[:, 0]) if is_loaded(world) else None
         known, rests = with_tangents(known, (world, dt)), jnp.full(dt.shape, any(always))
         first = Progress(start, resting, known, jnp.asarray(True), rests)
-        return checkpoint_name(lax.scan(maybe, first, jnp.array(self._phases(world)))[0].anchors, PASSED)
+        phases = jnp.array(list(enumerate(self._phases(world))), np.int32)
+        return checkpoint_name(lax.scan(maybe, first, phases)[0].anchors, PASSED)
 
     def _phases(self, world: "World") -> list[int]:
         impacts, loaded = self.sweeps + HOLDS * waits(world), is_loaded(world)
