@@ -159,6 +159,13 @@ def position(f: Flight, s: Array) -> Array:
     return f.x + t * (f.v + 0.5 * t * rate)
 
 
+def fall(f: Flight, s: Array) -> tuple[Array, Array]:
+    """What forces alone have added at time s to the position [m] and the velocity [m/s] of one body, (D, *batch)."""
+    t = (s - f.t0)[None]
+    way = 0.5 * t * t * (f.a if f.jerk is None else f.a + t * f.jerk / 3.0)
+    return way, t * (f.a if f.jolt is None else f.a + 0.5 * t * f.jolt)
+
+
 @jax.jit
 def orientation(f: Flight, s: Array) -> Array:
     """Orientation of one body at time s, (Q, *batch)."""

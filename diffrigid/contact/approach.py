@@ -66,12 +66,20 @@ def resting(task: Task, gaps: Gaps) -> Array:
     If one contact of the pair rests, so do all that are slow enough to come to rest anyway. Else, in a free flight
     without support, they would be found to close first, and hide the fast impact of another corner.
     """
-    gap, v, acc, _ = gaps
+    gap, v, acc, *_ = gaps
     near, slow = (NEAR * task.size)[None], task.slow[None]
     touching = touches(gap, v, acc, near, slow)
     # A contact that closes at a third of the speed of its fall would be back within the step, whatever e <= 1.
     least = slow + jnp.maximum(-acc, 0.0) * jnp.maximum(task.span, 0.0)[None] / 3.0
     return touching | (touches(gap, v, acc, near, least) & touching.any(0)[None])
+
+
+def taking_over(task: Task, gaps: Gaps, rests: Array) -> Array:
+    """`rests` (K, *batch), and contacts that carry on where another comes to the end of a face: they do not close."""
+    if gaps.held is None:
+        return rests
+    (gap, v), near, slow = gaps.held, (NEAR * task.size)[None], task.slow[None]
+    return rests | (touches(gap, v, gaps.acceleration, near, slow) & rests.any(0)[None])
 
 
 def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:
@@ -93,7 +101,7 @@ def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:
         return jnp.where(s < t1, unseen_for(b.shape, b.q, height, v, spinning), jnp.inf)
 
     def clear(gaps: Gaps, rests: Array, s: Array) -> Array:
-        gap, v, acc, normal = gaps
+        gap, v, acc, normal, _ = gaps
         if normal is None:
             apart = _time_to(gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
         else:
@@ -126,7 +134,7 @@ class Polish(NamedTuple):
 
 def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Polish:
     """Step from time s (*batch) [s] to where a gap is `level` (*batch) [m]."""
-    (gap, v, acc, _), slack, level = gaps, task.slack, level[None]
+    (gap, v, acc, *_), slack, level = gaps, task.slack, level[None]
     height = gap - level
     there = (jnp.abs(height) <= 8.0 * slack**2 * task.size[None]) & (v < 0)  # to rounding
     closing = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))

@@ -1,13 +1,22 @@
 """Gaps of a pair along the paths of its colliders, and their derivatives, for the search for their impact."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.collide import Contacts
-from diffrigid.contact.sides import Placed, Side, candidates_of, gap_rates, place, reach_of, relative_acceleration
+from diffrigid.contact.sides import (
+    Placed,
+    Side,
+    candidates_of,
+    gap_rates,
+    held_up,
+    place,
+    reach_of,
+    relative_acceleration,
+)
 from diffrigid.numerics import dot, norm
 from diffrigid.shapes import HalfSpace, radius, vertices
 from diffrigid.state import rotations
@@ -22,14 +31,17 @@ class Gaps(NamedTuple):
     rate: Array  # (K, *batch) [m/s]
     acceleration: Array  # (K, *batch) [m/s^2]
     normal: Array | None  # (K, D, *batch) None: that of a half-space
+    held: Any = None  # gaps and rates if forces had not displaced what rests, each (K, *batch); None: see `HeldUp`
 
 
-def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
-    """Gaps of all candidate contacts at time s (*batch) [s]."""
+def gaps_at(a: Side, b: Side, s: Array, live: Array, rests: Array) -> Gaps:
+    """Gaps of all candidate contacts at time s (*batch) [s] of a pair that `rests` (*batch) bool."""
     at_a, at_b = place(a, s, live), place(b, s, live)
     if isinstance(b.shape, HalfSpace):
         return _gaps_of_corners(a, at_a, b)
-    contacts = candidates_of(a, at_a, b, at_b)
+    held = held_up(a, at_a, b, at_b, s, rests)
+    at_a, at_b = held.at_a, held.at_b
+    contacts = held.contacts(candidates_of(a, at_a, b, at_b))
 
     def pull(n: Array, p: Array, gap: Array) -> Array:
         # At the cores: on a rounded surface, other material comes to the contact as it spins.
@@ -37,7 +49,11 @@ def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
         return dot(n, relative_acceleration(at_a, at_b, *at_cores))
 
     acceleration = jax.vmap(pull)(contacts.normal, contacts.point, contacts.gap)
-    return Gaps(contacts.gap, gap_rates(contacts, at_a, at_b), acceleration, contacts.normal)
+    rates, still = gap_rates(contacts, at_a, at_b), None
+    if held.way is not None:
+        way, speed = (jax.vmap(dot, (None, 0))(along, contacts.normal) for along in (held.way, held.speed))
+        still = contacts.gap - way, rates - speed
+    return Gaps(contacts.gap, rates, acceleration, contacts.normal, still)
 
 
 def _gaps_of_corners(a: Side, at: Placed, b: Side) -> Gaps:

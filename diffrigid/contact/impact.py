@@ -29,6 +29,7 @@ from diffrigid.contact.sides import (
     earliest,
     gap_rates,
     gap_rounding,
+    held_up,
     moving_along,
     place,
     reach_of,
@@ -67,7 +68,9 @@ def find_impact(
     s0, hit = checkpoint_name((s0, hit), FOUND)
     at_a, at_b = place(a, s0, live), place(b, s0, live)
     slack = jnp.maximum(AT_ONCE * smaller_size(a, b), gap_rounding(a, at_a, b, at_b))
-    moved = contacts_of(a, at_a, b, at_b)
+    held = held_up(a, at_a, b, at_b, s0, rests.any(0))
+    at_a, at_b = held.at_a, held.at_b
+    moved = held.contacts(contacts_of(a, at_a, b, at_b))
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
     closes = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
     if len(rests) == len(gap) == 1:  # as it falls, a resting contact would always be next, and hide others

@@ -70,9 +70,7 @@ def tables_of(world: "World") -> tuple[Table, ...]:
     return tuple(map(table, world.pairs))
 
 
-def isolated_impacts(
-    world: "World", start: Anchors, launch: Any, dt: Array, sweeps: int
-) -> tuple[Anchors, Array]:
+def isolated_impacts(world: "World", start: Anchors, launch: Any, dt: Array, sweeps: int) -> tuple[Anchors, Array]:
     """Anchors after passes of isolated impacts, and their number: `sweeps`, unless an impact is left that is none."""
     tables = tables_of(world)
 

@@ -137,7 +137,7 @@ class Contact:
         nothing = jnp.zeros((_rows(world), *start.state.x.shape[1:]), start.t0.dtype)
         known = Known(P=nothing, early=nothing, rubs=nothing[:, 0]) if is_loaded(world) else None
         known, rests = with_tangents(known, (world, dt)), jnp.full(dt.shape, any(always))
-        first = Progress(start, resting, known, jnp.asarray(True), rests)
+        first = Progress(start, resting, resting & False, known, jnp.asarray(True), rests)
         phases = jnp.array(list(enumerate(self._phases(world))), np.int32)
         return checkpoint_name(lax.scan(maybe, first, phases)[0].anchors, PASSED)
 
@@ -164,16 +164,18 @@ class Progress(NamedTuple):
 
     anchors: Anchors
     resting: Array  # (C, *batch) bool: contacts that rest
+    settled: Array  # (C, *batch) bool: those that rested where the paths began
     known: Known | None
     found: Array  # bool: the pass before had active contacts in some world
     rests: Array  # (*batch) bool: some contact of a world rests
 
 
 def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
-    anchors, resting, known, _, rests = now
+    anchors, resting, settled, known, _, rests = now
     impact, reverse, push = (phase == kind for kind in (IMPACT, REVERSE, PUSH))
     flight = launch(anchors.state, anchors.t0)
-    strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting)
+    strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting, settled)
+    settled = jnp.where(impact, strikes.rests, settled)
     opened = jnp.zeros(dt.shape, bool) if known is None else push & known.opened(strikes)
     # A world without resting contacts holds none at the end: on its own it would skip this pass.
     strikes = replace(strikes, gap=_closed(strikes, opened), held=strikes.held & (impact | rests)[None])
@@ -197,7 +199,7 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
 
     any_now = any_world(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
-    return Progress(anchors, resting, known, any_now, (resting | strikes.rests).any(0))
+    return Progress(anchors, resting, settled, known, any_now, (resting | strikes.rests).any(0))
 
 
 def _closed(strikes: Strikes, opened: Array) -> Array:
@@ -250,9 +252,12 @@ def _held(
     """
     impact, drives = phase == IMPACT, flags(driven(world), resting)
     held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | fallen)
-    slow = -jax.vmap(dot)(strikes.normal, strikes.v_rel) <= world.contact.rest_speed[None]
+    u, least = -jax.vmap(dot)(strikes.normal, strikes.v_rel), world.contact.rest_speed[None]
+    slow = u <= least
     comes = strikes.active & ~strikes.held & (slow | (strikes.now & stays))
-    held = jnp.where(phase == PUSH, resting & ~drives, held)
+    # Where friction has slowed a body, other corners may touch at the end than those that were held.
+    touches = strikes.active & (resting | (jnp.abs(u) <= least)) & ~drives
+    held = jnp.where(phase == PUSH, touches, held)
     return held, jnp.where(impact, resting | held | comes, jnp.where(phase == REVERSE, resting, held))
 
 

@@ -21,7 +21,7 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import any_world, choose, opaque_true
-from diffrigid.contact.approach import Polish, Task, clearance, if_smooth, polish, resting, task_of
+from diffrigid.contact.approach import Polish, Task, clearance, if_smooth, polish, resting, taking_over, task_of
 from diffrigid.contact.gaps import Gaps, gaps_at
 from diffrigid.contact.nearing import Closest, Nearing, from_time, level_at, look_at, nearer
 from diffrigid.contact.sides import Side, earliest
@@ -48,7 +48,8 @@ def approach_search(
     if width is not None and end.closest is not None:
 
         def smooth(nearest: Closest) -> Array:
-            closing, opening = (look_at(t, gaps_at(a, b, t, live)) for t in (nearest.before, nearest.after))
+            on = end.rests.any(0)
+            closing, opening = (look_at(t, gaps_at(a, b, t, live, on)) for t in (nearest.before, nearest.after))
             return jnp.where(nearest.exists, level_at(closing, opening, width), 0.0)
 
         nearest = checkpoint_name(end.closest, FOUND)
@@ -82,7 +83,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
     def advance(carry):
         count, s, dt, rests = carry
         s = jnp.where(s < task.t1, jnp.minimum(s + jnp.maximum(dt, 0.0), task.t1), s)
-        gaps = gaps_at(task.a, task.b, s, live)
+        gaps = gaps_at(task.a, task.b, s, live, no)
         rests = jnp.where(count == 0, resting(task, gaps), rests)
         return count + 1, s, clear(gaps, rests, s), rests
 
@@ -93,7 +94,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
 
     def approach(near):
         def look(now):
-            return nearer(task, now, gaps_at(task.a, task.b, now.t, live))
+            return nearer(task, now, gaps_at(task.a, task.b, now.t, live, no))
 
         seen = lax.while_loop(lambda now: ~at_end & any_world(~now.done), look, from_time(near))
         return _polished_from(task, near, seen), seen.level(task.width), seen.closest()
@@ -110,7 +111,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
 
     def along(carry):
         count, s, before = carry
-        look = polish(task, gaps_at(task.a, task.b, s, live), rests, level, s)
+        look = polish(task, gaps_at(task.a, task.b, s, live, no), rests, level, s)
         return count + 1, s + look.dt, look._replace(inside=jnp.where(count == 0, look.inside, before.inside))
 
     _, s, look = lax.while_loop(polishing, along, (0, near, Polish(jnp.zeros_like(near), no, no, no)))
@@ -120,7 +121,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
 
 def _count(task: Task, start: Array, live: Array) -> int:
     """Number of contacts."""
-    return len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start, live).gap))
+    return len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start, live, start < start).gap))
 
 
 class Search(NamedTuple):
@@ -152,7 +153,10 @@ def _in_one_loop(task: Task, start: Array, at_end: Array, live: Array) -> Found:
     def busy(now: Search) -> Array:
         return ~at_end & any_world(now.stage < DONE)
 
-    end = lax.while_loop(busy, lambda now: follow(now, gaps_at(task.a, task.b, now.s, live)), first)
+    def look(now: Search) -> Search:
+        return follow(now, gaps_at(task.a, task.b, now.s, live, now.rests.any(0)))
+
+    end = lax.while_loop(busy, look, first)
     nearest = None if end.nearing is None else end.nearing.closest()
     return Found(end.s, end.near, end.found, end.inside, end.rests, nearest)
 
@@ -162,7 +166,7 @@ def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
     clear = clearance(task)
 
     def follow(now: Search, gaps: Gaps) -> Search:
-        rests = jnp.where(now.count == 0, resting(task, gaps), now.rests)
+        rests = taking_over(task, gaps, jnp.where(now.count == 0, resting(task, gaps), now.rests))
         now = now._replace(count=now.count + 1, rests=rests)
         now = choose(now.stage == ADVANCING, _advanced(task, now, clear(gaps, rests, now.s)), now)
         following = choose(now.stage == POLISHING, _polished(task, now, gaps), now)

@@ -3,23 +3,23 @@
 import functools
 import itertools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.branches import unfused
+from diffrigid.branches import choose, unfused
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.contacts import FAR
 from diffrigid.collide.distance import reach
 from diffrigid.collide.heights import candidates
-from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
+from diffrigid.flight import Flight, angular_momentum, fall, orientation, position, velocity
 from diffrigid.gathers import fold, rows, sum_rows
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
-from diffrigid.shapes import BOUNDLESS, HeightField, radius
+from diffrigid.shapes import BOUNDLESS, Capsule, Disc, HalfSpace, HeightField, Sphere, radius
 from diffrigid.state import rotations
 
 if TYPE_CHECKING:
@@ -113,6 +113,36 @@ def began(a: Side, b: Side) -> Array:
     if b.flight is None or a.flight is None:
         return (a if b.flight is None else b).flight.t0
     return jnp.maximum(a.flight.t0, b.flight.t0)
+
+
+class HeldUp(NamedTuple):
+    """Two colliders placed as if forces had not displaced them where they rest on each other.
+
+    What rests falls on its path until it is held, and would be inside the other: there a corner that slides past the
+    end of a face may be nearer to another face, which it never strikes. Only which faces meet depends on it: between
+    flat faces and straight edges the gaps of the paths themselves are larger by `way` along the normal, exactly.
+    """
+
+    at_a: Placed
+    at_b: Placed
+    way: Array | None  # (D, *batch) [m] of a against b; None: half-spaces have no end, and what is round no flat faces
+    speed: Array | None  # (D, *batch) [m/s] its rate
+
+    def contacts(self, contacts: Contacts) -> Contacts:
+        """Contacts of the colliders as placed here, with the gaps of their paths."""
+        if self.way is None:
+            return contacts
+        return replace(contacts, gap=contacts.gap + jax.vmap(dot, (0, None))(contacts.normal, self.way))
+
+
+def held_up(a: Side, at_a: Placed, b: Side, at_b: Placed, s: Array, rests: Array) -> HeldUp:
+    """Hold up two colliders placed at s (*batch) [s] if they rest on each other, `rests` (*batch) bool."""
+    if isinstance(b.shape, HalfSpace) or any(isinstance(side.shape, Disc | Sphere | Capsule) for side in (a, b)):
+        return HeldUp(at_a, at_b, None, None)
+    none = (jnp.zeros_like(at_a.x),) * 2
+    falls = [none if side.flight is None else choose(rests, fall(side.flight, s), none) for side in (a, b)]
+    at_a, at_b = (replace(at, x=at.x - way) for at, (way, _) in zip((at_a, at_b), falls, strict=True))
+    return HeldUp(at_a, at_b, *map(jnp.subtract, *falls))
 
 
 def contacts_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:

@@ -10,6 +10,7 @@ from jax import Array, lax
 
 from diffrigid.branches import any_world, opaque_true, unfused
 from diffrigid.collide import Contacts, PairGroup
+from diffrigid.collide.contacts import FAR
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.impact import find_impact
@@ -24,6 +25,7 @@ from diffrigid.contact.sides import (
     contacts_of,
     difference,
     gap_rounding,
+    held_up,
     place,
     reach_of,
     relative_velocity,
@@ -47,11 +49,14 @@ if TYPE_CHECKING:
 DEEPEST = 0.2  # [-] of the smaller reach: deeper penetration is resolved in several steps
 
 
-def find_strikes(world: "World", flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array) -> Strikes:
+def find_strikes(
+    world: "World", flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array, settled: Array
+) -> Strikes:
     """List the contacts of every pair at its next impact, or the time it is held until; `at_end` (bool): at the end.
 
     Active are contacts that touch then, those of an impact only if it happens before the end. A contact that was
-    `resting` (C, *batch) still touches if it has opened by no more than a body falls in a step.
+    `resting` (C, *batch) still touches if it has opened by no more than a body falls in a step. Pairs with contacts
+    that rest, or were `settled` (C, *batch) where their paths began, are held up, see `HeldUp`.
     """
     width = world.contact.width
     groups = [sides_of(world, pairs, flight, since) for pairs in world.pairs]
@@ -65,10 +70,11 @@ def find_strikes(world: "World", flight: Flight, since: Array, dt: Array, at_end
     meetings = in_order(meetings, links, flight.t0, dt, at_end, bounces)
     parts, jacs, start = [], {}, 0
     for pairs, sides, meeting in zip(world.pairs, groups, meetings, strict=False):
-        rested = resting[start : start + len(pairs.a) * pairs.count].reshape(-1, pairs.count, *dt.shape)
-        start += len(pairs.a) * pairs.count
-        each = jax.vmap(lambda a, b, meeting, rested: strikes_of(a, b, meeting, rested, dt, is_loaded(world)))
-        part = unfused(opaque_true(dt), each, *sides, meeting, rested)
+        end = start + len(pairs.a) * pairs.count
+        before = [of[start:end].reshape(-1, pairs.count, *dt.shape) for of in (resting, resting | settled)]
+        start = end
+        each = jax.vmap(lambda a, b, meeting, *before: strikes_of(a, b, meeting, *before, dt, is_loaded(world)))
+        part = unfused(opaque_true(dt), each, *sides, meeting, *before)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1])
@@ -124,19 +130,24 @@ def next_meeting(world: "World", a: Side, b: Side, dt: Array, at_end: Array, wid
 def next_strikes(world: "World", a: Side, b: Side, dt: Array) -> Strikes:
     """The contacts of one pair at its next exact impact, (K, ...)."""
     meeting, never = next_meeting(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
-    return strikes_of(a, b, replace(meeting, now=meeting.fast, joins=never, held=never), never[None], dt, False)
+    meeting, never = replace(meeting, now=meeting.fast, joins=never, held=never), never[None]
+    return strikes_of(a, b, meeting, never, never, dt, False)
 
 
-def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loaded: bool) -> Strikes:
+def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, settled: Array, dt: Array, loaded: bool) -> Strikes:
     """Contacts of one pair, (K, ...); see `find_strikes`. `loaded`: whether resting contacts may carry a load."""
     s, held, live = meeting.s, meeting.held, opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
+    up = held_up(a, at_a, b, at_b, s, (meeting.rests | settled).any(0))
+    at_a, at_b = up.at_a, up.at_b
     contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
+    contacts = up.contacts(contacts)
     # Also contacts that opened because the body below fell away: they may close again once it is held, or struck.
     fall = dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None)
     opened = jnp.where((held | meeting.joins)[None] | rested, fall[None], 0.0)
     near = contacts.gap <= (meeting.level + meeting.slack)[None] + opened
-    active = (near | (meeting.rests & held[None])) & meeting.hit[None]
+    there = contacts.gap < 0.5 * FAR  # what rested may have left the face on which it did
+    active = (near | (meeting.rests & held[None])) & there & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
     size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
