@@ -472,3 +472,31 @@ def test_a_ball_that_rests_is_struck():
     differences = jnp.stack([(run(at + h[k])[0] - run(at - h[k])[0]) / 2e-6 for k in range(4)], axis=1)
     assert float(jnp.abs(differences).max()) > 10.0  # the ball does hit the floor
     assert_allclose(run(at)[1][0], differences, atol=1e-5)
+
+
+GROUNDS = {
+    "profile": (dr.Profile(points=((-1.0, 0.0), (0.0, 0.0), (0.5, 0.0), (1.0, -1.0))), (0.0, 0.0), (0.2, 0.05)),
+    "box": (dr.Box(half=(0.5, 0.4, 0.2)), (0.0, 0.0, -0.2), (0.2, 0.3, 0.05)),
+}  # shapes, their places, half sizes of the box that slides
+
+
+@pytest.mark.parametrize("ground", GROUNDS)
+def test_a_box_slides_past_an_edge_as_over_one_face(ground):
+    """Its centre stays over the ground; corners go beyond the edge at any phase of a step. Closed form v - mu g t."""
+    shape, x, half = GROUNDS[ground]
+    mu, level = 0.2, [0.0] * (len(x) - 1)
+
+    def slid(x0, y0, v):
+        place = (x0, *[y0][: len(level) - 1], half[-1])
+        box = dr.Body(dr.Box(half=half), mass=1.0, x=place, v=(v, *level))
+        return dr.scene({"box": box, "ground": dr.Static(shape, x=x)}, gravity=(*level, -G), friction=mu)
+
+    rng = np.random.default_rng(3)
+    v = rng.uniform(0.4, 1.5, 16)
+    starts = [slid(0.3 - 0.03 * v[k], rng.uniform(-0.12, 0.12), v[k]) for k in range(16)]
+    world, state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+    end = dr.rollout_batch(world, state, dt=1 / 60, steps=4, final_only=True)
+    assert_allclose(end.w, 0.0, atol=1e-9)
+    assert_allclose(end.x[:, 0, 1:], state.x[:, 0, 1:], atol=1e-9)
+    assert_allclose(end.v[:, 0, 0], np.maximum(v - mu * G * 4 / 60, 0.0), atol=1e-9)
+    assert (end.x[:, 0, 0] > 0.3).all()

@@ -73,7 +73,7 @@ def find_strikes(
         end = start + len(pairs.a) * pairs.count
         before = [of[start:end].reshape(-1, pairs.count, *dt.shape) for of in (resting, resting | settled)]
         start = end
-        each = jax.vmap(lambda a, b, meeting, *before: strikes_of(a, b, meeting, *before, dt, is_loaded(world)))
+        each = jax.vmap(functools.partial(strikes_of, dt=dt, loaded=is_loaded(world)))
         part = unfused(opaque_true(dt), each, *sides, meeting, *before)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
@@ -131,7 +131,7 @@ def next_strikes(world: "World", a: Side, b: Side, dt: Array) -> Strikes:
     """The contacts of one pair at its next exact impact, (K, ...)."""
     meeting, never = next_meeting(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
     meeting, never = replace(meeting, now=meeting.fast, joins=never, held=never), never[None]
-    return strikes_of(a, b, meeting, never, never, dt, False)
+    return strikes_of(a, b, meeting, never, never, dt, loaded=False)
 
 
 def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, settled: Array, dt: Array, loaded: bool) -> Strikes:
