@@ -475,21 +475,23 @@ def test_a_ball_that_rests_is_struck():
 
 
 GROUNDS = {
-    "profile": (dr.Profile(points=((-1.0, 0.0), (0.0, 0.0), (0.5, 0.0), (1.0, -1.0))), (0.0, 0.0), (0.2, 0.05)),
-    "box": (dr.Box(half=(0.5, 0.4, 0.2)), (0.0, 0.0, -0.2), (0.2, 0.3, 0.05)),
+    "profile": (dr.Profile(points=((-1.0, 0.0), (0.0, 0.0), (0.5, 0.0), (1.0, -1.0))), ((0.0, 0.0),), (0.2, 0.05)),
+    "box": (dr.Box(half=(0.5, 0.4, 0.2)), ((0.0, 0.0, -0.2),), (0.2, 0.3, 0.05)),
+    "tiles": (dr.Box(half=(0.5, 0.2)), ((0.0, -0.2), (1.0, -0.2)), (0.2, 0.05)),
 }  # shapes, their places, half sizes of the box that slides
 
 
 @pytest.mark.parametrize("ground", GROUNDS)
 def test_a_box_slides_past_an_edge_as_over_one_face(ground):
     """Its centre stays over the ground; corners go beyond the edge at any phase of a step. Closed form v - mu g t."""
-    shape, x, half = GROUNDS[ground]
-    mu, level = 0.2, [0.0] * (len(x) - 1)
+    shape, places, half = GROUNDS[ground]
+    mu, level = 0.2, [0.0] * (len(half) - 1)
+    statics = {f"ground{k}": dr.Static(shape, x=x) for k, x in enumerate(places)}
 
     def slid(x0, y0, v):
         place = (x0, *[y0][: len(level) - 1], half[-1])
         box = dr.Body(dr.Box(half=half), mass=1.0, x=place, v=(v, *level))
-        return dr.scene({"box": box, "ground": dr.Static(shape, x=x)}, gravity=(*level, -G), friction=mu)
+        return dr.scene({"box": box} | statics, gravity=(*level, -G), friction=mu)
 
     rng = np.random.default_rng(3)
     v = rng.uniform(0.4, 1.5, 16)

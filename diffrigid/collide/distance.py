@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.collide.contacts import ALERT
 from diffrigid.gathers import first_highest, rows
 from diffrigid.numerics import dot, norm, normalise, unit_vector
 from diffrigid.shapes import Box, Capsule, Disc, Hull, Polygon, Sphere, radius, vertices
@@ -51,6 +52,10 @@ def box_distance(shape: Box, p: Array, inward: Array, slack: Array) -> tuple[Arr
     beyond = (excess > slack[None]).sum(0) > 1
     outside = jnp.where(beyond[None], jnp.maximum(excess, 0.0), face)
     distance = jnp.where(beyond, norm(outside), dot(face, excess))
+    # What slides along the plane of a face comes to lie on it, and does not strike the face around the corner.
+    at = (jnp.abs(excess) <= slack[None]) & (side * inward > 0)
+    level = at.any(0) & ((at | (excess > slack[None])).sum(0) > 1)
+    distance = jnp.where(level, jnp.maximum(distance, ALERT * lax.stop_gradient(shape.half.min(0))), distance)
     return distance, side * normalise(outside)
 
 

@@ -23,10 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.collide.contacts import FAR, Contacts
+from diffrigid.collide.contacts import ALERT, FAR, Contacts
 from diffrigid.collide.distance import core_distance, reach
 from diffrigid.collide.edges import CROSSINGS, Edges, crossing, edges_of
-from diffrigid.collide.profile import ALERT
 from diffrigid.numerics import components, dot, norm, normalise, safe_divide
 from diffrigid.shapes import Capsule, HeightField, Sphere, edges, radius, vertices
 from diffrigid.so3 import cross

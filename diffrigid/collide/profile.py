@@ -17,13 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.collide.contacts import FAR, Contacts
+from diffrigid.collide.contacts import ALERT, FAR, Contacts
 from diffrigid.collide.distance import core_distance, reach
 from diffrigid.numerics import dot, norm, normalise
 from diffrigid.shapes import Disc, Profile, radius, vertices
 from diffrigid.state import rotations
 
-ALERT = 4e-3  # [-] of the size: least gap of a feature that may be met within the step; above `NEAR` of the search
 STRAIGHT = 1e-4  # [-] 1 - cosine of two segments, below which a body moves along them as along one
 TURN = 1e-9  # [rad] least turn of a convex vertex
 

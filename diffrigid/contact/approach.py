@@ -3,6 +3,7 @@
 Source: Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems (1996), for the advancement.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -79,7 +80,8 @@ def taking_over(task: Task, gaps: Gaps, rests: Array) -> Array:
     if gaps.held is None:
         return rests
     (gap, v), near, slow = gaps.held, (NEAR * task.size)[None], task.slow[None]
-    return rests | (touches(gap, v, gaps.acceleration, near, slow) & rests.any(0)[None])
+    supported = functools.reduce(jnp.logical_or, [s.supported for s in (task.a, task.b) if s.supported is not None])
+    return rests | (touches(gap, v, gaps.acceleration, near, slow) & supported[None])
 
 
 def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:

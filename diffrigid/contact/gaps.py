@@ -31,15 +31,15 @@ class Gaps(NamedTuple):
     rate: Array  # (K, *batch) [m/s]
     acceleration: Array  # (K, *batch) [m/s^2]
     normal: Array | None  # (K, D, *batch) None: that of a half-space
-    held: Any = None  # gaps and rates if forces had not displaced what rests, each (K, *batch); None: see `HeldUp`
+    held: Any = None  # gaps and rates of `HeldUp`, each (K, *batch); None: nothing is held up
 
 
-def gaps_at(a: Side, b: Side, s: Array, live: Array, rests: Array) -> Gaps:
-    """Gaps of all candidate contacts at time s (*batch) [s] of a pair that `rests` (*batch) bool."""
+def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
+    """Gaps of all candidate contacts at time s (*batch) [s]."""
     at_a, at_b = place(a, s, live), place(b, s, live)
     if isinstance(b.shape, HalfSpace):
         return _gaps_of_corners(a, at_a, b)
-    held = held_up(a, at_a, b, at_b, s, rests)
+    held = held_up(a, at_a, b, at_b, s)
     at_a, at_b = held.at_a, held.at_b
     contacts = held.contacts(candidates_of(a, at_a, b, at_b))
 

@@ -18,8 +18,8 @@ from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide.profile import on_next_segments
-from diffrigid.contact.approach import if_smooth, touches
-from diffrigid.contact.gaps import NEAR, at_corners
+from diffrigid.contact.approach import if_smooth, resting, task_of, touches
+from diffrigid.contact.gaps import NEAR, at_corners, gaps_at
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.search import approach_search
 from diffrigid.contact.sides import (
@@ -68,7 +68,7 @@ def find_impact(
     s0, hit = checkpoint_name((s0, hit), FOUND)
     at_a, at_b = place(a, s0, live), place(b, s0, live)
     slack = jnp.maximum(AT_ONCE * smaller_size(a, b), gap_rounding(a, at_a, b, at_b))
-    held = held_up(a, at_a, b, at_b, s0, rests.any(0))
+    held = held_up(a, at_a, b, at_b, s0)
     at_a, at_b = held.at_a, held.at_b
     moved = held.contacts(contacts_of(a, at_a, b, at_b))
     gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
@@ -94,6 +94,15 @@ def find_impact(
     elif isinstance(b.shape, Profile):
         rests = on_next_segments(a.shape, b.shape, rests)
     return Meeting(s=s, hit=hit | at_end, fast=closes.any(0), rests=rests & ~at_end, level=level, slack=slack)
+
+
+def rests_at_start(a: Side, b: Side, t1: Array, straight: bool, rest_speed: Array) -> Array:
+    """Whether two colliders rest on each other where their paths begin, (*batch) bool."""
+    a, b, t1, rest_speed = lax.stop_gradient((a, b, t1, rest_speed))
+    if closed_form(a.shape, b.shape, straight):
+        return _round_rests(a, b, earliest(a, b)[0], rest_speed)
+    task = task_of(a, b, t1, None, rest_speed)
+    return resting(task, gaps_at(a, b, task.start, opaque_true(t1))).any(0)
 
 
 def _round_rests(a: Side, b: Side, start: Array, rest_speed: Array) -> Array:

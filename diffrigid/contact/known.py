@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.branches import any_world
+from diffrigid.collide.contacts import FAR
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
@@ -43,6 +44,13 @@ class Known:
         turning_rows = len(self.P) - len(gap)
         P = jnp.concatenate([self.P[:turning_rows], self.P[2 * turning_rows :]]) if turning_rows else self.P
         return ((gap > 0) & (P != 0).any(1)).any(0)
+
+    def there(self, strikes: Strikes) -> "Known":
+        """Only the impulses of contacts that are still there: those of faces that were left have no arms."""
+        on = strikes.gap < 0.5 * FAR
+        turning_rows = len(self.P) - len(on)
+        on = jnp.concatenate([on[:turning_rows], on]) if turning_rows else on
+        return jax.tree.map(lambda leaf: jnp.where(on if leaf.ndim == on.ndim else on[:, None], leaf, 0.0), self)
 
 
 def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tuple[Strikes, Law]:

@@ -39,9 +39,11 @@ from diffrigid.contact.strikes import (
     driving,
     ends,
     find_strikes,
+    find_supported,
     is_loaded,
     is_rolling,
     may_meet,
+    meets_faces,
     waits,
 )
 from diffrigid.flight import Flight, state_at
@@ -137,7 +139,8 @@ class Contact:
         nothing = jnp.zeros((_rows(world), *start.state.x.shape[1:]), start.t0.dtype)
         known = Known(P=nothing, early=nothing, rubs=nothing[:, 0]) if is_loaded(world) else None
         known, rests = with_tangents(known, (world, dt)), jnp.full(dt.shape, any(always))
-        first = Progress(start, resting, resting & False, known, jnp.asarray(True), rests)
+        supported = jnp.zeros(start.t0.shape, bool) if meets_faces(world) else None
+        first = Progress(start, resting, supported, known, jnp.asarray(True), rests)
         phases = jnp.array(list(enumerate(self._phases(world))), np.int32)
         return checkpoint_name(lax.scan(maybe, first, phases)[0].anchors, PASSED)
 
@@ -164,18 +167,20 @@ class Progress(NamedTuple):
 
     anchors: Anchors
     resting: Array  # (C, *batch) bool: contacts that rest
-    settled: Array  # (C, *batch) bool: those that rested where the paths began
+    supported: Array | None  # (N, *batch) bool: bodies that rest on something where their paths begin
     known: Known | None
     found: Array  # bool: the pass before had active contacts in some world
     rests: Array  # (*batch) bool: some contact of a world rests
 
 
 def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
-    anchors, resting, settled, known, _, rests = now
+    anchors, resting, supported, known, _, rests = now
     impact, reverse, push = (phase == kind for kind in (IMPACT, REVERSE, PUSH))
     flight = launch(anchors.state, anchors.t0)
-    strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting, settled)
-    settled = jnp.where(impact, strikes.rests, settled)
+    if supported is not None:
+        look = functools.partial(find_supported, world, flight, anchors.since, dt)
+        supported = lax.cond(impact, look, lambda kept=supported: kept)
+    strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting, supported)
     opened = jnp.zeros(dt.shape, bool) if known is None else push & known.opened(strikes)
     # A world without resting contacts holds none at the end: on its own it would skip this pass.
     strikes = replace(strikes, gap=_closed(strikes, opened), held=strikes.held & (impact | rests)[None])
@@ -191,7 +196,7 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
         if known is None:
             return applied(None)[0], None
         nothing = jax.tree.map(jnp.zeros_like, known)
-        after, friction, load = applied(choose(unused, nothing, known))
+        after, friction, load = applied(choose(unused, nothing, known).there(strikes))
         friction = choose(phase == HOLD, friction, nothing)
         reverses, load = friction.reverses(), jnp.where(impact | push, 0.0, load)
         following = replace(friction, P=jnp.where(reverses, friction.P, load))
@@ -199,7 +204,7 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
 
     any_now = any_world(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
-    return Progress(anchors, resting, settled, known, any_now, (resting | strikes.rests).any(0))
+    return Progress(anchors, resting, supported, known, any_now, (resting | strikes.rests).any(0))
 
 
 def _closed(strikes: Strikes, opened: Array) -> Array:

@@ -48,8 +48,7 @@ def approach_search(
     if width is not None and end.closest is not None:
 
         def smooth(nearest: Closest) -> Array:
-            on = end.rests.any(0)
-            closing, opening = (look_at(t, gaps_at(a, b, t, live, on)) for t in (nearest.before, nearest.after))
+            closing, opening = (look_at(t, gaps_at(a, b, t, live)) for t in (nearest.before, nearest.after))
             return jnp.where(nearest.exists, level_at(closing, opening, width), 0.0)
 
         nearest = checkpoint_name(end.closest, FOUND)
@@ -83,7 +82,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
     def advance(carry):
         count, s, dt, rests = carry
         s = jnp.where(s < task.t1, jnp.minimum(s + jnp.maximum(dt, 0.0), task.t1), s)
-        gaps = gaps_at(task.a, task.b, s, live, no)
+        gaps = gaps_at(task.a, task.b, s, live)
         rests = jnp.where(count == 0, resting(task, gaps), rests)
         return count + 1, s, clear(gaps, rests, s), rests
 
@@ -94,7 +93,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
 
     def approach(near):
         def look(now):
-            return nearer(task, now, gaps_at(task.a, task.b, now.t, live, no))
+            return nearer(task, now, gaps_at(task.a, task.b, now.t, live))
 
         seen = lax.while_loop(lambda now: ~at_end & any_world(~now.done), look, from_time(near))
         return _polished_from(task, near, seen), seen.level(task.width), seen.closest()
@@ -111,7 +110,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
 
     def along(carry):
         count, s, before = carry
-        look = polish(task, gaps_at(task.a, task.b, s, live, no), rests, level, s)
+        look = polish(task, gaps_at(task.a, task.b, s, live), rests, level, s)
         return count + 1, s + look.dt, look._replace(inside=jnp.where(count == 0, look.inside, before.inside))
 
     _, s, look = lax.while_loop(polishing, along, (0, near, Polish(jnp.zeros_like(near), no, no, no)))
@@ -121,7 +120,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
 
 def _count(task: Task, start: Array, live: Array) -> int:
     """Number of contacts."""
-    return len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start, live, start < start).gap))
+    return len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start, live).gap))
 
 
 class Search(NamedTuple):
@@ -153,10 +152,7 @@ def _in_one_loop(task: Task, start: Array, at_end: Array, live: Array) -> Found:
     def busy(now: Search) -> Array:
         return ~at_end & any_world(now.stage < DONE)
 
-    def look(now: Search) -> Search:
-        return follow(now, gaps_at(task.a, task.b, now.s, live, now.rests.any(0)))
-
-    end = lax.while_loop(busy, look, first)
+    end = lax.while_loop(busy, lambda now: follow(now, gaps_at(task.a, task.b, now.s, live)), first)
     nearest = None if end.nearing is None else end.nearing.closest()
     return Found(end.s, end.near, end.found, end.inside, end.rests, nearest)
 

@@ -36,6 +36,7 @@ class Side:
     since: Any = array(default=None)  # [s] earliest time for which the path holds
     shape: Any
     offset: Any = array("D", default=None)  # [m] shape origin from the centre of mass, body axes
+    supported: Any = array(default=None)  # bool: it rests on something where its path begins; None: not asked for
     x: Any = array("D", default=None)
     q: Any = array("Q", default=None)
 
@@ -54,10 +55,19 @@ class Placed:
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
 
 
-def sides_of(world: "World", pairs: PairGroup, flight: Flight, since: Array) -> tuple[Side, Side]:
-    """Both sides of P pairs of one kind, every array with a leading axis P."""
+def sides_of(
+    world: "World", pairs: PairGroup, flight: Flight, since: Array, supported: Array | None = None
+) -> tuple[Side, Side]:
+    """Both sides of P pairs of one kind, every array with a leading axis P. `supported`: (N, *batch) bool."""
     a = side_of(world, flight, since, pairs.shape_a, pairs.row_a, pairs.a)
-    return a, side_of(world, flight, since, pairs.shape_b, pairs.row_b, pairs.b)
+    b = side_of(world, flight, since, pairs.shape_b, pairs.row_b, pairs.b)
+    if supported is None or not have_faces(a, b):
+        return a, b
+    a, b = (
+        replace(side, supported=None if side.flight is None else rows(supported, colliders))
+        for side, colliders in ((a, pairs.a), (b, pairs.b))
+    )
+    return a, b
 
 
 def side_of(world: "World", flight: Flight, since: Array, kind: int, shape_rows: tuple, colliders: tuple) -> Side:
@@ -116,16 +126,16 @@ def began(a: Side, b: Side) -> Array:
 
 
 class HeldUp(NamedTuple):
-    """Two colliders placed as if forces had not displaced them where they rest on each other.
+    """Two colliders placed as if forces had not displaced those that are supported.
 
-    What rests falls on its path until it is held, and would be inside the other: there a corner that slides past the
-    end of a face may be nearer to another face, which it never strikes. Only which faces meet depends on it: between
-    flat faces and straight edges the gaps of the paths themselves are larger by `way` along the normal, exactly.
+    What rests falls on its path until it is held, into what it rests on: there a corner that slides past the end of a
+    face may be nearer to another face, which it never strikes. Only which faces meet depends on it: between flat faces
+    and straight edges the gaps of the paths themselves are larger by `way` along the normal, exactly.
     """
 
     at_a: Placed
     at_b: Placed
-    way: Array | None  # (D, *batch) [m] of a against b; None: half-spaces have no end, and what is round no flat faces
+    way: Array | None  # (D, *batch) [m] of a against b; None: neither is moved
     speed: Array | None  # (D, *batch) [m/s] its rate
 
     def contacts(self, contacts: Contacts) -> Contacts:
@@ -135,14 +145,19 @@ class HeldUp(NamedTuple):
         return replace(contacts, gap=contacts.gap + jax.vmap(dot, (0, None))(contacts.normal, self.way))
 
 
-def held_up(a: Side, at_a: Placed, b: Side, at_b: Placed, s: Array, rests: Array) -> HeldUp:
-    """Hold up two colliders placed at s (*batch) [s] if they rest on each other, `rests` (*batch) bool."""
-    if isinstance(b.shape, HalfSpace) or any(isinstance(side.shape, Disc | Sphere | Capsule) for side in (a, b)):
+def held_up(a: Side, at_a: Placed, b: Side, at_b: Placed, s: Array) -> HeldUp:
+    """Hold up what is supported of two colliders placed at s (*batch) [s]."""
+    if a.supported is None and b.supported is None:
         return HeldUp(at_a, at_b, None, None)
     none = (jnp.zeros_like(at_a.x),) * 2
-    falls = [none if side.flight is None else choose(rests, fall(side.flight, s), none) for side in (a, b)]
+    falls = [none if side.supported is None else choose(side.supported, fall(side.flight, s), none) for side in (a, b)]
     at_a, at_b = (replace(at, x=at.x - way) for at, (way, _) in zip((at_a, at_b), falls, strict=True))
     return HeldUp(at_a, at_b, *map(jnp.subtract, *falls))
+
+
+def have_faces(a: Side, b: Side) -> bool:
+    """Whether flat faces of two colliders may meet that end somewhere; that of a half-space does not. Static."""
+    return not isinstance(b.shape, HalfSpace) and not any(isinstance(s.shape, Disc | Sphere | Capsule) for s in (a, b))
 
 
 def contacts_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:

@@ -1,6 +1,7 @@
 """One list of all contacts of a world, whatever the kinds of their shapes, followed by the rows of its joints."""
 
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import jax
@@ -13,7 +14,7 @@ from diffrigid.collide import Contacts, PairGroup
 from diffrigid.collide.contacts import FAR
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
-from diffrigid.contact.impact import find_impact
+from diffrigid.contact.impact import find_impact, rests_at_start
 from diffrigid.contact.impulse import effective_matrix, restitution_at
 from diffrigid.contact.levers import acceleration, coriolis, levers, with_rates
 from diffrigid.contact.order import Links, Meeting, in_order
@@ -29,6 +30,7 @@ from diffrigid.contact.sides import (
     place,
     reach_of,
     relative_velocity,
+    side_sum,
     sides_of,
     smaller_size,
 )
@@ -40,7 +42,7 @@ from diffrigid.joints import Weld
 from diffrigid.linkage import ends_of, islands
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
-from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Sphere
+from diffrigid.shapes import Capsule, Disc, HalfSpace, HeightField, Profile, Sphere
 from diffrigid.state import rotations
 
 if TYPE_CHECKING:
@@ -50,16 +52,16 @@ DEEPEST = 0.2  # [-] of the smaller reach: deeper penetration is resolved in sev
 
 
 def find_strikes(
-    world: "World", flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array, settled: Array
+    world: "World", flight: Flight, since: Array, dt: Array, at_end: Array, resting: Array, supported: Array | None
 ) -> Strikes:
     """List the contacts of every pair at its next impact, or the time it is held until; `at_end` (bool): at the end.
 
     Active are contacts that touch then, those of an impact only if it happens before the end. A contact that was
-    `resting` (C, *batch) still touches if it has opened by no more than a body falls in a step. Pairs with contacts
-    that rest, or were `settled` (C, *batch) where their paths began, are held up, see `HeldUp`.
+    `resting` (C, *batch) still touches if it has opened by no more than a body falls in a step. Bodies that are
+    `supported` (N, *batch) where their paths begin are held up, see `HeldUp`.
     """
     width = world.contact.width
-    groups = [sides_of(world, pairs, flight, since) for pairs in world.pairs]
+    groups = [sides_of(world, pairs, flight, since, supported) for pairs in world.pairs]
     meetings = [jax.vmap(lambda a, b: next_meeting(world, a, b, dt, at_end, width))(*sides) for sides in groups]
     if stops_of(world):
         meetings.append(meet_stops(world, flight, since, dt, at_end))
@@ -70,11 +72,10 @@ def find_strikes(
     meetings = in_order(meetings, links, flight.t0, dt, at_end, bounces)
     parts, jacs, start = [], {}, 0
     for pairs, sides, meeting in zip(world.pairs, groups, meetings, strict=False):
-        end = start + len(pairs.a) * pairs.count
-        before = [of[start:end].reshape(-1, pairs.count, *dt.shape) for of in (resting, resting | settled)]
-        start = end
+        rested = resting[start : start + len(pairs.a) * pairs.count].reshape(-1, pairs.count, *dt.shape)
+        start += len(pairs.a) * pairs.count
         each = jax.vmap(functools.partial(strikes_of, dt=dt, loaded=is_loaded(world)))
-        part = unfused(opaque_true(dt), each, *sides, meeting, *before)
+        part = unfused(opaque_true(dt), each, *sides, meeting, rested)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1])
@@ -121,6 +122,30 @@ def is_loaded(world: "World") -> bool:
     return bool(world.forces or world.joints) or any(map(turns_a_side, world.pairs))
 
 
+def meets_faces(world: "World") -> bool:
+    """Whether flat faces may meet that end somewhere: there it matters which bodies are supported. Static."""
+    ends = (Disc, Sphere, Capsule, HalfSpace)
+    return any(
+        not issubclass(type(world.shapes[pairs.shape_a]), ends) and not isinstance(world.shapes[pairs.shape_b], ends)
+        for pairs in world.pairs
+    )
+
+
+def find_supported(world: "World", flight: Flight, since: Array, dt: Array) -> Array:
+    """Which bodies rest on something where their paths begin, (N, *batch) bool."""
+    found = []
+    for pairs in world.pairs:
+        a, b = sides_of(world, pairs, flight, since)
+        straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
+        rests: Callable = functools.partial(
+            rests_at_start, t1=dt, straight=straight, rest_speed=world.contact.rest_speed
+        )
+        found.append(jax.vmap(rests)(a, b))
+    on = jnp.concatenate(found).astype(dt.dtype)
+    first, second = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
+    return side_sum(on, on, first, second, len(world.names)) > 0
+
+
 def next_meeting(world: "World", a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
     """The next impact of one pair, or the end of the step where `at_end` (a bool)."""
     straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
@@ -130,15 +155,15 @@ def next_meeting(world: "World", a: Side, b: Side, dt: Array, at_end: Array, wid
 def next_strikes(world: "World", a: Side, b: Side, dt: Array) -> Strikes:
     """The contacts of one pair at its next exact impact, (K, ...)."""
     meeting, never = next_meeting(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
-    meeting, never = replace(meeting, now=meeting.fast, joins=never, held=never), never[None]
-    return strikes_of(a, b, meeting, never, never, dt, loaded=False)
+    meeting = replace(meeting, now=meeting.fast, joins=never, held=never)
+    return strikes_of(a, b, meeting, never[None], dt, loaded=False)
 
 
-def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, settled: Array, dt: Array, loaded: bool) -> Strikes:
+def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loaded: bool) -> Strikes:
     """Contacts of one pair, (K, ...); see `find_strikes`. `loaded`: whether resting contacts may carry a load."""
     s, held, live = meeting.s, meeting.held, opaque_true(dt)
     at_a, at_b = place(a, s, live), place(b, s, live)
-    up = held_up(a, at_a, b, at_b, s, (meeting.rests | settled).any(0))
+    up = held_up(a, at_a, b, at_b, s)
     at_a, at_b = up.at_a, up.at_b
     contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
     contacts = up.contacts(contacts)
