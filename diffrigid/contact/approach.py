@@ -3,7 +3,6 @@
 Source: Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems (1996), for the advancement.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ from jax import Array, lax
 from diffrigid.branches import any_world
 from diffrigid.collide.heights import height_over, unseen_for
 from diffrigid.contact.gaps import NEAR, Gaps
-from diffrigid.contact.sides import Side, centre, core_reach_of, earliest, reach_of
+from diffrigid.contact.sides import Side, centre, core_reach_of, earliest, is_supported, reach_of
 from diffrigid.gathers import MANY, fold
 from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.shapes import HeightField
@@ -80,8 +79,7 @@ def taking_over(task: Task, gaps: Gaps, rests: Array) -> Array:
     if gaps.held is None:
         return rests
     (gap, v), near, slow = gaps.held, (NEAR * task.size)[None], task.slow[None]
-    supported = functools.reduce(jnp.logical_or, [s.supported for s in (task.a, task.b) if s.supported is not None])
-    return rests | (touches(gap, v, gaps.acceleration, near, slow) & supported[None])
+    return rests | (touches(gap, v, gaps.acceleration, near, slow) & is_supported(task.a, task.b)[None])
 
 
 def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:

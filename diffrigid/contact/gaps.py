@@ -39,9 +39,9 @@ def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
     at_a, at_b = place(a, s, live), place(b, s, live)
     if isinstance(b.shape, HalfSpace):
         return _gaps_of_corners(a, at_a, b)
-    held = held_up(a, at_a, b, at_b, s)
-    at_a, at_b = held.at_a, held.at_b
-    contacts = held.contacts(candidates_of(a, at_a, b, at_b))
+    up = held_up(a, at_a, b, at_b, s)
+    at_a, at_b = up.at_a, up.at_b
+    contacts = candidates_of(a, at_a, b, at_b)
 
     def pull(n: Array, p: Array, gap: Array) -> Array:
         # At the cores: on a rounded surface, other material comes to the contact as it spins.
@@ -49,11 +49,10 @@ def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
         return dot(n, relative_acceleration(at_a, at_b, *at_cores))
 
     acceleration = jax.vmap(pull)(contacts.normal, contacts.point, contacts.gap)
-    rates, still = gap_rates(contacts, at_a, at_b), None
-    if held.way is not None:
-        way, speed = (jax.vmap(dot, (None, 0))(along, contacts.normal) for along in (held.way, held.speed))
-        still = contacts.gap - way, rates - speed
-    return Gaps(contacts.gap, rates, acceleration, contacts.normal, still)
+    rates, held = gap_rates(contacts, at_a, at_b), None
+    if up.speed is not None:
+        held = contacts.gap, rates - jax.vmap(dot, (None, 0))(up.speed, contacts.normal)
+    return Gaps(up.gaps(contacts), rates, acceleration, contacts.normal, held)
 
 
 def _gaps_of_corners(a: Side, at: Placed, b: Side) -> Gaps:

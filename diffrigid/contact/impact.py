@@ -68,10 +68,11 @@ def find_impact(
     s0, hit = checkpoint_name((s0, hit), FOUND)
     at_a, at_b = place(a, s0, live), place(b, s0, live)
     slack = jnp.maximum(AT_ONCE * smaller_size(a, b), gap_rounding(a, at_a, b, at_b))
-    held = held_up(a, at_a, b, at_b, s0)
-    at_a, at_b = held.at_a, held.at_b
-    moved = held.contacts(contacts_of(a, at_a, b, at_b))
-    gap, speed = lax.stop_gradient((moved.gap, gap_rates(moved, at_a, at_b)))
+    up = held_up(a, at_a, b, at_b, s0)
+    at_a, at_b = up.at_a, up.at_b
+    contacts = contacts_of(a, at_a, b, at_b)
+    gaps = up.gaps(contacts)
+    gap, speed = lax.stop_gradient((gaps, gap_rates(contacts, at_a, at_b)))
     closes = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
     if len(rests) == len(gap) == 1:  # as it falls, a resting contact would always be next, and hide others
         closes = closes & ~rests
@@ -80,8 +81,10 @@ def find_impact(
     struck = jnp.where(there.any(0)[None], there, closes).astype(s0.dtype)
     share = struck / jnp.maximum(struck.sum(0), 1.0)[None]
     along = moving_along(a, at_a, s0), moving_along(b, at_b, s0)
-    slope = lax.stop_gradient(share * gap_rates(moved, *along)).sum(0)  # for derivatives only: a rollout is spared it
-    s = implicit_root(s0, (share * moved.gap).sum(0) - level, slope)
+    slope = lax.stop_gradient(share * gap_rates(contacts, *along)).sum(
+        0
+    )  # for derivatives only: a rollout is spared it
+    s = implicit_root(s0, (share * gaps).sum(0) - level, slope)
     # A contact that is inside where the paths begin is struck there, whatever its gap; one that turns round inside, and
     # closes again, where it is found: neither is where a gap vanishes.
     inside = closes & (gap < lax.stop_gradient(level - slack)[None])
@@ -90,7 +93,7 @@ def find_impact(
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
     if len(rests) != len(gap):  # contacts are a selection: of the corners of a box, or of places on a grid
         few = isinstance(b.shape, HalfSpace)
-        rests = at_corners(a, at_a, moved, rests) if few else jnp.broadcast_to(rests.any(0), gap.shape)
+        rests = at_corners(a, at_a, contacts, rests) if few else jnp.broadcast_to(rests.any(0), gap.shape)
     elif isinstance(b.shape, Profile):
         rests = on_next_segments(a.shape, b.shape, rests)
     return Meeting(s=s, hit=hit | at_end, fast=closes.any(0), rests=rests & ~at_end, level=level, slack=slack)

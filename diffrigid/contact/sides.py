@@ -138,11 +138,9 @@ class HeldUp(NamedTuple):
     way: Array | None  # (D, *batch) [m] of a against b; None: neither is moved
     speed: Array | None  # (D, *batch) [m/s] its rate
 
-    def contacts(self, contacts: Contacts) -> Contacts:
-        """Contacts of the colliders as placed here, with the gaps of their paths."""
-        if self.way is None:
-            return contacts
-        return replace(contacts, gap=contacts.gap + jax.vmap(dot, (0, None))(contacts.normal, self.way))
+    def gaps(self, contacts: Contacts) -> Array:
+        """Gaps of the paths, (K, *batch) [m], from contacts of the colliders as placed here."""
+        return contacts.gap if self.way is None else contacts.gap + jax.vmap(dot, (0, None))(contacts.normal, self.way)
 
 
 def held_up(a: Side, at_a: Placed, b: Side, at_b: Placed, s: Array) -> HeldUp:
@@ -153,6 +151,12 @@ def held_up(a: Side, at_a: Placed, b: Side, at_b: Placed, s: Array) -> HeldUp:
     falls = [none if side.supported is None else choose(side.supported, fall(side.flight, s), none) for side in (a, b)]
     at_a, at_b = (replace(at, x=at.x - way) for at, (way, _) in zip((at_a, at_b), falls, strict=True))
     return HeldUp(at_a, at_b, *map(jnp.subtract, *falls))
+
+
+def is_supported(a: Side, b: Side) -> Array:
+    """Whether one of two colliders is supported, (*batch) bool."""
+    flags = [side.supported for side in (a, b) if side.supported is not None]
+    return functools.reduce(jnp.logical_or, flags, jnp.zeros(began(a, b).shape, bool))
 
 
 def have_faces(a: Side, b: Side) -> bool:

@@ -27,6 +27,7 @@ from diffrigid.contact.sides import (
     difference,
     gap_rounding,
     held_up,
+    is_supported,
     place,
     reach_of,
     relative_velocity,
@@ -166,21 +167,20 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     up = held_up(a, at_a, b, at_b, s)
     at_a, at_b = up.at_a, up.at_b
     contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
-    contacts = up.contacts(contacts)
+    gaps, apart = up.gaps(contacts), held | is_supported(a, b)  # else the two are where they strike
     # Also contacts that opened because the body below fell away: they may close again once it is held, or struck.
     fall = dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None)
     opened = jnp.where((held | meeting.joins)[None] | rested, fall[None], 0.0)
-    near = contacts.gap <= (meeting.level + meeting.slack)[None] + opened
-    there = contacts.gap < 0.5 * FAR  # what rested may have left the face on which it did
+    near = gaps <= (meeting.level + meeting.slack)[None] + opened
+    there = gaps < 0.5 * FAR  # what rested may have left the face on which it did
     active = (near | (meeting.rests & held[None])) & there & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
     size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
     T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
 
-    def each(contact: Contacts, moving: Contacts | None) -> Strikes:
-        gap = contact.gap
-        lever = levers(replace(contact, gap=jnp.where(held, gap, 0.0)), moving, turns, at_a, at_b, drift, T)
+    def each(contact: Contacts, moving: Contacts | None, gap: Array) -> Strikes:
+        lever = levers(replace(contact, gap=jnp.where(apart, contact.gap, 0.0)), moving, turns, at_a, at_b, drift, T)
         sides = at_a, (a.flight, lever.arm_a), at_b, (b.flight, lever.arm_b)
         forces = difference(lambda at, of: acceleration(of[0], at, s, of[1]), *sides)
         v_rel = relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b)
@@ -196,7 +196,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
             press=-dot(contact.normal, forces), pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip
 
-    return replace(jax.vmap(each)(contacts, moving), active=active, rests=meeting.rests)
+    return replace(jax.vmap(each)(contacts, moving, gaps), active=active, rests=meeting.rests)
 
 
 def relative_path_is_straight(world: "World", both_move: bool) -> bool:
