@@ -12,7 +12,8 @@ from jax import Array, lax
 from diffrigid.branches import any_world
 from diffrigid.collide.heights import height_over, unseen_for
 from diffrigid.contact.gaps import NEAR, Gaps
-from diffrigid.contact.sides import Side, centre, core_reach_of, earliest, is_supported, reach_of
+from diffrigid.contact.held_up import is_supported
+from diffrigid.contact.sides import Side, centre, core_reach_of, earliest, reach_of
 from diffrigid.gathers import MANY, fold
 from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.shapes import HeightField

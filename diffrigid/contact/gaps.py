@@ -7,16 +7,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.collide import Contacts
-from diffrigid.contact.sides import (
-    Placed,
-    Side,
-    candidates_of,
-    gap_rates,
-    held_up,
-    place,
-    reach_of,
-    relative_acceleration,
-)
+from diffrigid.contact.held_up import held_up
+from diffrigid.contact.sides import Placed, Side, candidates_of, gap_rates, place, reach_of, relative_acceleration
 from diffrigid.numerics import dot, norm
 from diffrigid.shapes import HalfSpace, radius, vertices
 from diffrigid.state import rotations

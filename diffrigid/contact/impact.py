@@ -18,8 +18,9 @@ from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide.profile import on_next_segments
-from diffrigid.contact.approach import if_smooth, resting, task_of, touches
-from diffrigid.contact.gaps import NEAR, at_corners, gaps_at
+from diffrigid.contact.approach import if_smooth, touches
+from diffrigid.contact.gaps import NEAR, at_corners
+from diffrigid.contact.held_up import held_up
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.search import approach_search
 from diffrigid.contact.sides import (
@@ -29,7 +30,6 @@ from diffrigid.contact.sides import (
     earliest,
     gap_rates,
     gap_rounding,
-    held_up,
     moving_along,
     place,
     reach_of,
@@ -60,7 +60,7 @@ def find_impact(
     varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
     if closed_form(a.shape, b.shape, straight) and not varying:
         s0, level, found, _ = unfused(live, approach, a, b, width)
-        rests = _round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
+        rests = round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
     else:
         s0, level, found, rests = approach_search(a, b, t1, width, rest_speed, at_end)
     hit = found & (s0 <= t1) & ~at_end
@@ -81,9 +81,8 @@ def find_impact(
     struck = jnp.where(there.any(0)[None], there, closes).astype(s0.dtype)
     share = struck / jnp.maximum(struck.sum(0), 1.0)[None]
     along = moving_along(a, at_a, s0), moving_along(b, at_b, s0)
-    slope = lax.stop_gradient(share * gap_rates(contacts, *along)).sum(
-        0
-    )  # for derivatives only: a rollout is spared it
+    # For derivatives only: a rollout is spared it.
+    slope = lax.stop_gradient(share * gap_rates(contacts, *along)).sum(0)
     s = implicit_root(s0, (share * gaps).sum(0) - level, slope)
     # A contact that is inside where the paths begin is struck there, whatever its gap; one that turns round inside, and
     # closes again, where it is found: neither is where a gap vanishes.
@@ -99,16 +98,7 @@ def find_impact(
     return Meeting(s=s, hit=hit | at_end, fast=closes.any(0), rests=rests & ~at_end, level=level, slack=slack)
 
 
-def rests_at_start(a: Side, b: Side, t1: Array, straight: bool, rest_speed: Array) -> Array:
-    """Whether two colliders rest on each other where their paths begin, (*batch) bool."""
-    a, b, t1, rest_speed = lax.stop_gradient((a, b, t1, rest_speed))
-    if closed_form(a.shape, b.shape, straight):
-        return _round_rests(a, b, earliest(a, b)[0], rest_speed)
-    task = task_of(a, b, t1, None, rest_speed)
-    return resting(task, gaps_at(a, b, task.start, opaque_true(t1))).any(0)
-
-
-def _round_rests(a: Side, b: Side, start: Array, rest_speed: Array) -> Array:
+def round_rests(a: Side, b: Side, start: Array, rest_speed: Array) -> Array:
     """Whether two round shapes, or one and a half-space, touch at the start and stay together, (*batch) bool."""
     (x_a, v_a), (x_b, v_b) = centre(a, start), centre(b, start)
     if isinstance(b.shape, HalfSpace):

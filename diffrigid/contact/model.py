@@ -39,13 +39,12 @@ from diffrigid.contact.strikes import (
     driving,
     ends,
     find_strikes,
-    find_supported,
     is_loaded,
     is_rolling,
     may_meet,
-    meets_faces,
     waits,
 )
+from diffrigid.contact.supported import find_supported, meets_faces
 from diffrigid.flight import Flight, state_at
 from diffrigid.gathers import flags
 from diffrigid.numerics import FOUND, PASSED, dot, safe_divide, saving, with_tangents

@@ -3,19 +3,19 @@
 import functools
 import itertools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.branches import choose, unfused
+from diffrigid.branches import unfused
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.contacts import FAR
 from diffrigid.collide.distance import reach
 from diffrigid.collide.heights import candidates
-from diffrigid.flight import Flight, angular_momentum, fall, orientation, position, velocity
+from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import fold, rows, sum_rows
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
@@ -61,7 +61,7 @@ def sides_of(
     """Both sides of P pairs of one kind, every array with a leading axis P. `supported`: (N, *batch) bool."""
     a = side_of(world, flight, since, pairs.shape_a, pairs.row_a, pairs.a)
     b = side_of(world, flight, since, pairs.shape_b, pairs.row_b, pairs.b)
-    if supported is None or not have_faces(a, b):
+    if supported is None or not have_faces(type(a.shape), type(b.shape)):
         return a, b
     a, b = (
         replace(side, supported=None if side.flight is None else rows(supported, colliders))
@@ -125,43 +125,9 @@ def began(a: Side, b: Side) -> Array:
     return jnp.maximum(a.flight.t0, b.flight.t0)
 
 
-class HeldUp(NamedTuple):
-    """Two colliders placed as if forces had not displaced those that are supported.
-
-    What rests falls on its path until it is held, into what it rests on: there a corner that slides past the end of a
-    face may be nearer to another face, which it never strikes. Only which faces meet depends on it: between flat faces
-    and straight edges the gaps of the paths themselves are larger by `way` along the normal, exactly.
-    """
-
-    at_a: Placed
-    at_b: Placed
-    way: Array | None  # (D, *batch) [m] of a against b; None: neither is moved
-    speed: Array | None  # (D, *batch) [m/s] its rate
-
-    def gaps(self, contacts: Contacts) -> Array:
-        """Gaps of the paths, (K, *batch) [m], from contacts of the colliders as placed here."""
-        return contacts.gap if self.way is None else contacts.gap + jax.vmap(dot, (0, None))(contacts.normal, self.way)
-
-
-def held_up(a: Side, at_a: Placed, b: Side, at_b: Placed, s: Array) -> HeldUp:
-    """Hold up what is supported of two colliders placed at s (*batch) [s]."""
-    if a.supported is None and b.supported is None:
-        return HeldUp(at_a, at_b, None, None)
-    none = (jnp.zeros_like(at_a.x),) * 2
-    falls = [none if side.supported is None else choose(side.supported, fall(side.flight, s), none) for side in (a, b)]
-    at_a, at_b = (replace(at, x=at.x - way) for at, (way, _) in zip((at_a, at_b), falls, strict=True))
-    return HeldUp(at_a, at_b, *map(jnp.subtract, *falls))
-
-
-def is_supported(a: Side, b: Side) -> Array:
-    """Whether one of two colliders is supported, (*batch) bool."""
-    flags = [side.supported for side in (a, b) if side.supported is not None]
-    return functools.reduce(jnp.logical_or, flags, jnp.zeros(began(a, b).shape, bool))
-
-
-def have_faces(a: Side, b: Side) -> bool:
-    """Whether flat faces of two colliders may meet that end somewhere; that of a half-space does not. Static."""
-    return not isinstance(b.shape, HalfSpace) and not any(isinstance(s.shape, Disc | Sphere | Capsule) for s in (a, b))
+def have_faces(a: type, b: type) -> bool:
+    """Whether flat faces of shapes of two kinds may meet that end somewhere; that of a half-space does not."""
+    return b is not HalfSpace and not {a, b} & {Disc, Sphere, Capsule}
 
 
 def contacts_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:

@@ -1,7 +1,6 @@
 """One list of all contacts of a world, whatever the kinds of their shapes, followed by the rows of its joints."""
 
 import functools
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import jax
@@ -14,7 +13,8 @@ from diffrigid.collide import Contacts, PairGroup
 from diffrigid.collide.contacts import FAR
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
-from diffrigid.contact.impact import find_impact, rests_at_start
+from diffrigid.contact.held_up import held_up, is_supported
+from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix, restitution_at
 from diffrigid.contact.levers import acceleration, coriolis, levers, with_rates
 from diffrigid.contact.order import Links, Meeting, in_order
@@ -26,12 +26,9 @@ from diffrigid.contact.sides import (
     contacts_of,
     difference,
     gap_rounding,
-    held_up,
-    is_supported,
     place,
     reach_of,
     relative_velocity,
-    side_sum,
     sides_of,
     smaller_size,
 )
@@ -43,7 +40,7 @@ from diffrigid.joints import Weld
 from diffrigid.linkage import ends_of, islands
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
-from diffrigid.shapes import Capsule, Disc, HalfSpace, HeightField, Profile, Sphere
+from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Sphere
 from diffrigid.state import rotations
 
 if TYPE_CHECKING:
@@ -121,30 +118,6 @@ def is_loaded(world: "World") -> bool:
         return kinds[1] is not HalfSpace and not all(issubclass(kind, Disc | Sphere) for kind in kinds)
 
     return bool(world.forces or world.joints) or any(map(turns_a_side, world.pairs))
-
-
-def meets_faces(world: "World") -> bool:
-    """Whether flat faces may meet that end somewhere: there it matters which bodies are supported. Static."""
-    ends = (Disc, Sphere, Capsule, HalfSpace)
-    return any(
-        not issubclass(type(world.shapes[pairs.shape_a]), ends) and not isinstance(world.shapes[pairs.shape_b], ends)
-        for pairs in world.pairs
-    )
-
-
-def find_supported(world: "World", flight: Flight, since: Array, dt: Array) -> Array:
-    """Which bodies rest on something where their paths begin, (N, *batch) bool."""
-    found = []
-    for pairs in world.pairs:
-        a, b = sides_of(world, pairs, flight, since)
-        straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
-        rests: Callable = functools.partial(
-            rests_at_start, t1=dt, straight=straight, rest_speed=world.contact.rest_speed
-        )
-        found.append(jax.vmap(rests)(a, b))
-    on = jnp.concatenate(found).astype(dt.dtype)
-    first, second = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
-    return side_sum(on, on, first, second, len(world.names)) > 0
 
 
 def next_meeting(world: "World", a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:

@@ -1,0 +1,47 @@
+"""Which bodies rest on something where their paths begin: `held_up.py` needs to know before a search for impacts."""
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrigid.branches import opaque_true
+from diffrigid.contact.approach import resting, task_of
+from diffrigid.contact.gaps import gaps_at
+from diffrigid.contact.impact import closed_form, round_rests
+from diffrigid.contact.sides import Side, earliest, have_faces, side_sum, sides_of
+from diffrigid.contact.strikes import relative_path_is_straight
+from diffrigid.flight import Flight
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
+
+
+def meets_faces(world: "World") -> bool:
+    """Whether flat faces may meet that end somewhere: only there it matters which bodies are supported. Static."""
+    return any(have_faces(*(type(world.shapes[kind]) for kind in (p.shape_a, p.shape_b))) for p in world.pairs)
+
+
+def find_supported(world: "World", flight: Flight, since: Array, dt: Array) -> Array:
+    """Which bodies rest on something where their paths begin, (N, *batch) bool."""
+    found = []
+    for pairs in world.pairs:
+        a, b = sides_of(world, pairs, flight, since)
+        straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
+        rests: Callable = functools.partial(_rests, t1=dt, straight=straight, rest_speed=world.contact.rest_speed)
+        found.append(jax.vmap(rests)(a, b))
+    on = jnp.concatenate(found).astype(dt.dtype)
+    first, second = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
+    return side_sum(on, on, first, second, len(world.names)) > 0
+
+
+def _rests(a: Side, b: Side, t1: Array, straight: bool, rest_speed: Array) -> Array:
+    """Whether two colliders rest on each other where their paths begin, (*batch) bool."""
+    a, b, t1, rest_speed = lax.stop_gradient((a, b, t1, rest_speed))
+    if closed_form(a.shape, b.shape, straight):
+        return round_rests(a, b, earliest(a, b)[0], rest_speed)
+    task = task_of(a, b, t1, None, rest_speed)
+    return resting(task, gaps_at(a, b, task.start, opaque_true(t1))).any(0)
