@@ -12,6 +12,7 @@ and not one of rounding. `slack` (*batch) [m] is the distance within which p is 
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from diffrigid.collide.contacts import ALERT
@@ -52,11 +53,8 @@ def box_distance(shape: Box, p: Array, inward: Array, slack: Array) -> tuple[Arr
     beyond = (excess > slack[None]).sum(0) > 1
     outside = jnp.where(beyond[None], jnp.maximum(excess, 0.0), face)
     distance = jnp.where(beyond, norm(outside), dot(face, excess))
-    # What slides along the plane of a face comes to lie on it, and does not strike the face around the corner.
     at = (jnp.abs(excess) <= slack[None]) & (side * inward > 0)
-    level = at.any(0) & ((at | (excess > slack[None])).sum(0) > 1)
-    distance = jnp.where(level, jnp.maximum(distance, ALERT * lax.stop_gradient(shape.half.min(0))), distance)
-    return distance, side * normalise(outside)
+    return _alerted(distance, at, (at | (excess > slack[None])).sum(0) > 1, slack), side * normalise(outside)
 
 
 def polygon_distance(shape: Polygon, p: Array, inward: Array, slack: Array) -> tuple[Array, Array]:
@@ -67,8 +65,8 @@ def polygon_distance(shape: Polygon, p: Array, inward: Array, slack: Array) -> t
     along = edge / length[:, None]
     outward = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
     dots = jax.vmap(dot, in_axes=(0, None))
-    height = jax.vmap(dot)(outward, p[None] - start)
-    best = jnp.argmax(_reachable(height, dots(outward, inward), slack), axis=0)
+    height, facing = jax.vmap(dot)(outward, p[None] - start), dots(outward, inward)
+    best = jnp.argmax(_reachable(height, facing, slack), axis=0)
     chosen = jax.nn.one_hot(best, height.shape[0], axis=0, dtype=p.dtype)
     n, distance = (chosen[:, None] * outward).sum(0), (chosen * height).sum(0)
     r = p - (chosen[:, None] * start).sum(0)
@@ -76,7 +74,9 @@ def polygon_distance(shape: Polygon, p: Array, inward: Array, slack: Array) -> t
     beyond = ((share < -slack) | (share > end + slack)) & (distance > 0)
     corner = r - jnp.where(share > 0.5 * end, 1.0, 0.0).astype(p.dtype)[None] * (chosen[:, None] * edge).sum(0)
     away = jnp.where(beyond[None], corner, n)
-    return jnp.where(beyond, norm(away), distance), normalise(away)
+    at = (jnp.abs(height) <= slack[None]) & (facing > 0)
+    several = (at | (height > slack[None])).sum(0) > 1
+    return _alerted(jnp.where(beyond, norm(away), distance), at, several, slack), normalise(away)
 
 
 def hull_distance(shape: Hull, p: Array, inward: Array, slack: Array) -> tuple[Array, Array]:
@@ -95,7 +95,10 @@ def hull_distance(shape: Hull, p: Array, inward: Array, slack: Array) -> tuple[A
     beyond = ~inside & ~((chosen > 0) & on_face).any(0)
     corner = p - (chosen[:, None] * closest).sum(0)
     away = jnp.where(beyond[None], corner, (chosen[:, None] * outward).sum(0))
-    return jnp.where(beyond, norm(away), (chosen * height).sum(0)), normalise(away)
+    at = (jnp.abs(height) <= slack[None]) & (facing > 0)
+    planes = norm(lax.stop_gradient(jnp.where(at[:, None], outward, 0.0).sum(0)))  # less than their number, if several
+    several = (height > slack[None]).any(0) | (planes < at.sum(0).astype(p.dtype) - 1e-6)
+    return _alerted(jnp.where(beyond, norm(away), (chosen * height).sum(0)), at, several, slack), normalise(away)
 
 
 def _triangle(a: Array, b: Array, c: Array, n: Array, height: Array, p: Array, slack: Array):
@@ -114,6 +117,19 @@ def closest_on_segment(start: Array, end: Array, p: Array) -> Array:
     along = end - start
     share = jnp.clip(dot(p - start, along) / dot(along, along), 0.0, 1.0)
     return start + share[None] * along
+
+
+def _alerted(distance: Array, at: Array, several: Array, slack: Array) -> Array:
+    """Distance, no less than ALERT at a corner that slides along the plane of a face, until it is over that face.
+
+    It comes to lie on the face, and does not strike the one around the corner.
+
+    Args:
+        at: (F, *batch) bool: faces in whose plane it is, with its body in front of them.
+        several: (*batch) bool: it is also outside another face, or in the planes of several.
+    """
+    alert = ALERT / float(np.sqrt(np.finfo(slack.dtype).eps)) * slack  # of the size that `slack` belongs to
+    return jnp.where(at.any(0) & several, jnp.maximum(distance, lax.stop_gradient(alert)), distance)
 
 
 def _reachable(height: Array, facing: Array, slack: Array) -> Array:

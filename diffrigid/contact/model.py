@@ -44,7 +44,7 @@ from diffrigid.contact.strikes import (
     may_meet,
     waits,
 )
-from diffrigid.contact.supported import find_supported, meets_faces
+from diffrigid.contact.supported import find_supported, matters
 from diffrigid.flight import Flight, state_at
 from diffrigid.gathers import flags
 from diffrigid.numerics import FOUND, PASSED, dot, safe_divide, saving, with_tangents
@@ -138,7 +138,7 @@ class Contact:
         nothing = jnp.zeros((_rows(world), *start.state.x.shape[1:]), start.t0.dtype)
         known = Known(P=nothing, early=nothing, rubs=nothing[:, 0]) if is_loaded(world) else None
         known, rests = with_tangents(known, (world, dt)), jnp.full(dt.shape, any(always))
-        supported = jnp.zeros(start.t0.shape, bool) if meets_faces(world) else None
+        supported = jnp.zeros(start.t0.shape, bool) if matters(world) else None
         first = Progress(start, resting, supported, known, jnp.asarray(True), rests)
         phases = jnp.array(list(enumerate(self._phases(world))), np.int32)
         return checkpoint_name(lax.scan(maybe, first, phases)[0].anchors, PASSED)

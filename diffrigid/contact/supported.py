@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from diffrigid.world import World
 
 
-def meets_faces(world: "World") -> bool:
-    """Whether flat faces may meet that end somewhere: only there it matters which bodies are supported. Static."""
-    return any(have_faces(*(type(world.shapes[kind]) for kind in (p.shape_a, p.shape_b))) for p in world.pairs)
+def matters(world: "World") -> bool:
+    """Whether it matters which bodies are supported: where they fall and flat faces meet that end somewhere. Static."""
+    falls = bool(world.forces or world.joints)
+    return falls and any(have_faces(*(type(world.shapes[k]) for k in (p.shape_a, p.shape_b))) for p in world.pairs)
 
 
 def find_supported(world: "World", flight: Flight, since: Array, dt: Array) -> Array:
