@@ -12,6 +12,7 @@ which is Newton's law at a slightly larger distance: it keeps momentum, makes no
 (gap_min far below zero) as they are, and lets a near miss pull.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
@@ -21,6 +22,7 @@ from diffrigid.collide.profile import on_next_segments
 from diffrigid.contact.approach import if_smooth, touches
 from diffrigid.contact.gaps import NEAR, at_corners
 from diffrigid.contact.held_up import held_up
+from diffrigid.contact.levers import with_rates
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.search import approach_search
 from diffrigid.contact.sides import (
@@ -70,7 +72,11 @@ def find_impact(
     slack = jnp.maximum(AT_ONCE * smaller_size(a, b), gap_rounding(a, at_a, b, at_b))
     up = held_up(a, at_a, b, at_b, s0)
     at_a, at_b = up.at_a, up.at_b
-    contacts = contacts_of(a, at_a, b, at_b)
+    if up.way is None:
+        contacts, turning = contacts_of(a, at_a, b, at_b), 0.0
+    else:
+        contacts, moving = with_rates(live, a, at_a, b, at_b)
+        turning = jax.vmap(dot, (0, None))(moving.normal, up.way)  # in the rates of the gaps, as normals turn
     gaps = up.gaps(contacts)
     gap, speed = lax.stop_gradient((gaps, gap_rates(contacts, at_a, at_b)))
     closes = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
@@ -82,7 +88,7 @@ def find_impact(
     share = struck / jnp.maximum(struck.sum(0), 1.0)[None]
     along = moving_along(a, at_a, s0), moving_along(b, at_b, s0)
     # For derivatives only: a rollout is spared it.
-    slope = lax.stop_gradient(share * gap_rates(contacts, *along)).sum(0)
+    slope = lax.stop_gradient(share * (gap_rates(contacts, *along) + turning)).sum(0)
     s = implicit_root(s0, (share * gaps).sum(0) - level, slope)
     # A contact that is inside where the paths begin is struck there, whatever its gap; one that turns round inside, and
     # closes again, where it is found: neither is where a gap vanishes.
