@@ -486,7 +486,9 @@ GROUNDS = {
 }  # shapes, their places, half sizes of the box that slides
 
 
-@pytest.mark.parametrize("ground", GROUNDS)
+@pytest.mark.parametrize(
+    "ground", ["box", "tiles", *(pytest.param(name, marks=pytest.mark.slow) for name in ("profile", "slabs"))]
+)
 def test_a_box_slides_past_an_edge_as_over_one_face(ground):
     """Its centre stays over the ground; corners go beyond the edge at any phase of a step. Closed form v - mu g t."""
     shape, places, half = GROUNDS[ground]
