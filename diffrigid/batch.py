@@ -49,6 +49,8 @@ def rollout_batch(
 ) -> State:  # fmt: skip
     """States of B worlds, from `world` and `state`, any leaf of which may have a leading batch axis.
 
+    States that are off their joints are brought onto them first, as in `rollout`.
+
     Args:
         dt: [s].
         steps: T >= 1.

@@ -35,7 +35,7 @@ WORLDS = 1024  # under `jax.vmap`: `memory` has room for so many worlds where th
 
 @uncollected
 def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
-    """State after dt [s].
+    """State after dt [s]. A state that is off its joints is brought onto them first, as in `rollout`.
 
     Args:
         controls: values (D or A, *batch) that forces with a `control` add, by its name; held over the step.
