@@ -178,7 +178,7 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
     flight = launch(anchors.state, anchors.t0)
     if supported is not None:
         look = functools.partial(find_supported, world, flight, anchors.since, dt)
-        supported = lax.cond(impact, look, lambda kept=supported: kept)
+        supported = checkpoint_name(lax.cond(impact, look, lambda kept=supported: kept), FOUND)
     strikes = find_strikes(world, flight, anchors.since, dt, ~impact, resting, supported)
     opened = jnp.zeros(dt.shape, bool) if known is None else push & known.opened(strikes)
     # A world without resting contacts holds none at the end: on its own it would skip this pass.

@@ -11,6 +11,7 @@ Above a half-space, where a look is cheap, each stage is a loop. Otherwise the g
 stages share one loop, so that the gaps are compiled once; every world is in a stage of its own.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -44,18 +45,34 @@ def approach_search(
     task, live = task_of(a, b, t1, width, rest_speed), opaque_true(t1)
     search = _stage_by_stage if isinstance(b.shape, HalfSpace) else _in_one_loop
     end = search(task, jnp.where(at_end, task.t1, task.start), at_end, live)
-    level = jnp.zeros_like(end.s)
-    if width is not None and end.closest is not None:
-
-        def smooth(nearest: Closest) -> Array:
-            closing, opening = (look_at(t, gaps_at(a, b, t, live)) for t in (nearest.before, nearest.after))
-            return jnp.where(nearest.exists, level_at(closing, opening, width), 0.0)
-
-        nearest = checkpoint_name(end.closest, FOUND)
-        level = if_smooth(width, smooth, lambda nearest: jnp.zeros_like(nearest.before), nearest)
+    level, closest = checkpoint_name((end.level, end.closest), FOUND)
+    if width is not None:
+        level = _differentiable(level, width, a, b, closest, live)
     s, (_, bound) = jnp.where(end.found, end.s, end.near), earliest(task.a, task.b)
     rests = checkpoint_name(end.rests, FOUND)
     return jnp.where(s < bound, task.start, s), level, end.found | end.inside, rests
+
+
+@jax.custom_jvp
+def _differentiable(level: Array, width: Array, a: Side, b: Side, closest: Closest, live: Array) -> Array:
+    """The level (*batch) [m] that a search has found, with the derivatives of the gaps at the closest approach."""
+    del width, a, b, closest, live
+    return level
+
+
+@_differentiable.defjvp
+def _differentiable_jvp(primals, tangents):
+    level, width, a, b, closest, live = primals
+
+    def at_closest(width: Array, a: Side, b: Side) -> Array:
+        looks = jax.vmap(lambda t: look_at(t, gaps_at(a, b, t, live)))(jnp.stack([closest.before, closest.after]))
+        before, after = (jax.tree.map(operator.itemgetter(k), looks) for k in range(2))
+        return jnp.where(closest.exists, level_at(before, after, width), 0.0)
+
+    def smooth() -> Array:
+        return jax.jvp(at_closest, primals[1:4], tangents[1:4])[1]
+
+    return level, if_smooth(width, smooth, lambda: jnp.zeros_like(level))
 
 
 class Found(NamedTuple):
@@ -63,6 +80,7 @@ class Found(NamedTuple):
 
     s: Array  # (*batch) [s] where they meet, if `found`
     near: Array  # (*batch) [s] where the polishing began
+    level: Array  # (*batch) [m] level of the gap there
     found: Array  # (*batch) bool: some contact is at its level
     inside: Array  # (*batch) bool: some contact was within its level and closing there
     rests: Array  # (K, *batch) bool: contacts that rest, which are left out
@@ -115,7 +133,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
 
     _, s, look = lax.while_loop(polishing, along, (0, near, Polish(jnp.zeros_like(near), no, no, no)))
     found = look.found(task) & ~nothing
-    return Found(s, near, found, look.inside & ~nothing, rests, None if task.width is None else nearest)
+    return Found(s, near, level, found, look.inside & ~nothing, rests, None if task.width is None else nearest)
 
 
 def _count(task: Task, start: Array, live: Array) -> int:
@@ -154,7 +172,7 @@ def _in_one_loop(task: Task, start: Array, at_end: Array, live: Array) -> Found:
 
     end = lax.while_loop(busy, lambda now: follow(now, gaps_at(task.a, task.b, now.s, live)), first)
     nearest = None if end.nearing is None else end.nearing.closest()
-    return Found(end.s, end.near, end.found, end.inside, end.rests, nearest)
+    return Found(end.s, end.near, end.level, end.found, end.inside, end.rests, nearest)
 
 
 def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
