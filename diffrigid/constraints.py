@@ -28,7 +28,7 @@ class PlacedJoints(NamedTuple):
 
 def placed(joints: tuple, statics: Any, x: Array, q: Array) -> tuple[PlacedJoints, ...]:
     """All joints of a world whose bodies have poses x (N, D, *batch), q (N, Q, *batch)."""
-    every = _poses(statics, x, q)
+    every = poses(statics, x, q)
 
     def at(ends: tuple[int, ...]) -> Pose:
         return Pose(rows(every.x, ends), rows(every.q, ends))
@@ -36,7 +36,7 @@ def placed(joints: tuple, statics: Any, x: Array, q: Array) -> tuple[PlacedJoint
     return tuple(PlacedJoints(replace(group, a=None, b=None), at(group.a), at(group.b)) for group in joints)
 
 
-def _poses(statics: Any, x: Array, q: Array) -> Pose:
+def poses(statics: Any, x: Array, q: Array) -> Pose:
     """Poses of all colliders: bodies, then statics, then the world, which is at the origin."""
     batch = x.shape[2:]
     still = [jnp.broadcast_to(leaf, leaf.shape[:2] + batch) for leaf in (statics.x, statics.q)]

@@ -13,6 +13,7 @@ Lagrange multipliers, SIGGRAPH 1996.
 """
 
 import functools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -65,7 +66,9 @@ def plan(ends: tuple[tuple[int, int], ...], moving: int) -> Plan:
         levels.append(level)
     solutions = [i for level in reversed(sets) for i in level]
     places = tuple(solutions.index(i) for i in range(len(on)))
-    return Plan(pairs=pairs, levels=tuple(levels), places=places, is_tree=_is_tree(ends, moving))
+    grounded = [(min(a, moving), min(b, moving)) for a, b in ends]  # all statics count as one body
+    is_tree = len(ends) == moving + 1 - len(set(islands(grounded, moving + 1)))
+    return Plan(pairs=pairs, levels=tuple(levels), places=places, is_tree=is_tree)
 
 
 def _independent_sets(graph: dict[int, set[int]]) -> list[list[int]]:
@@ -122,21 +125,15 @@ def _level(pivots, blocks, left, later, first) -> tuple[Level, list, list]:
     return level, kept, kept_rows
 
 
-def _is_tree(ends: tuple[tuple[int, int], ...], moving: int) -> bool:
-    """Whether the joints form no loops; all statics count as one body."""
-    root = list(range(moving + 1))
-
-    def top(i):
-        while root[i] != i:
-            i = root[i]
-        return i
-
+def islands(ends: Iterable[tuple[int, int]], moving: int) -> tuple[tuple[int, ...], ...]:
+    """Moving bodies connected with each moving body by joints with these ends, itself included."""
+    together = [{body} for body in range(moving)]
     for a, b in ends:
-        a, b = top(min(a, moving)), top(min(b, moving))
-        if a == b:
-            return False
-        root[a] = b
-    return True
+        if a < moving and b < moving and together[a] is not together[b]:
+            together[a] |= together[b]
+            for body in together[b]:
+                together[body] = together[a]
+    return tuple(tuple(sorted(bodies)) for bodies in together)
 
 
 class Factor(NamedTuple):

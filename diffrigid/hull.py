@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 FLAT = 1e-5  # of a shape's size, or rad: less than this counts as flat; above the rounding of float32
 
@@ -11,7 +12,7 @@ def hull_faces(vertices) -> tuple:
     """Triangles (i, j, k) of the surface of a convex hull, counter-clockwise seen from outside.
 
     Args:
-        vertices: (V, 3) concrete numbers, each a corner of the hull; V up to about 64: the cost grows as V^4.
+        vertices: (V, 3) concrete numbers, each a corner of the hull.
 
     A flat face with more than three corners becomes a fan from one of them.
     """
@@ -60,42 +61,16 @@ def _bend(corners, i, j, k, l):
 
 
 def _flat_faces(corners):
-    """Flat faces of the hull of (V, 3) corners: lists of indices, counter-clockwise seen from outside.
-
-    Brute force: a plane through three corners holds a face if no corner is above it.
-    """
-    triples, normals, heights = _planes(corners)
-    margin = FLAT * extent(corners)
-    found = []
-    for n in np.flatnonzero((heights <= margin).all(1)):
-        # larger triangles come first, so the plane of a face is not taken from three corners almost in line
-        if not any(set(triples[n]) <= set(face) for face in found):
-            on = np.flatnonzero(heights[n] >= -margin)
+    """Flat faces of the hull of (V, 3) corners: lists of indices, counter-clockwise seen from outside."""
+    hull = ConvexHull(corners)  # of triangles, several of which may lie in one face
+    normals, (a, b, c) = hull.equations[:, :3], corners[hull.simplices].transpose(1, 0, 2)
+    heights, found = normals @ corners.T + hull.equations[:, 3:], []
+    # Larger triangles first: the plane of a face is not taken from three corners almost in line.
+    for n in np.argsort(-np.linalg.norm(np.cross(b - a, c - a), axis=1), kind="stable"):
+        if not any(set(hull.simplices[n]) <= set(face) for face in found):
+            on = np.flatnonzero(heights[n] >= -FLAT * extent(corners))
             found.append(_around(corners, on, normals[n]))
     return found
-
-
-def _planes(corners):
-    """Planes through three corners, in both senses, by falling area of the triangle.
-
-    Returns:
-        indices (T, 3), unit normals (T, 3), and heights of all corners over each plane (T, V) [m].
-    """
-    triples = np.array(list(itertools.combinations(range(len(corners)), 3)))
-    a, b, c = corners[triples].transpose(1, 0, 2)
-    normals = np.cross(b - a, c - a)
-    area = np.linalg.norm(normals, axis=1)
-    longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)], axis=0)
-    order = np.argsort(-area, kind="stable")
-    order = order[area[order] > FLAT * extent(corners) * longest[order]]  # three in line define no plane
-    normals = normals[order] / area[order, None]
-    heights = normals @ corners.T - (normals * a[order]).sum(1, keepdims=True)
-    return np.repeat(triples[order], 2, axis=0), *(_both_senses(rows) for rows in (normals, heights))
-
-
-def _both_senses(rows):
-    """Each row followed by its negative: (T, n) -> (2 T, n)."""
-    return np.stack([rows, -rows], axis=1).reshape(-1, rows.shape[1])
 
 
 def _around(corners, on, normal):

@@ -3,7 +3,7 @@
 A trajectory stores states, not impulses, so they are inferred, one interval between two stored times after the other:
 
     who touches    shapes that come together on their free flight from the start of the interval, or lie together
-                   through it; corner against side, and in 3D edge against edge, in the plane or space of the cores
+                   through it; corner against side or face, and in 3D edge against edge, of the cores
     impulses       the smallest that, at these points and in the joints, explain the changes of momentum and angular
                    momentum beyond what the forces do in the interval (least norm: where points share a load, equally)
 

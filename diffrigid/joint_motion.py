@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.constraints import change, placed
+from diffrigid.elimination import islands
 from diffrigid.joints import Pose, Prismatic, Revolute
-from diffrigid.linkage import ends_of, islands, to_sides
+from diffrigid.linkage import ends_of, to_sides
 from diffrigid.numerics import dot
 from diffrigid.pytree import replace
 from diffrigid.state import State, rotations

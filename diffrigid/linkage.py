@@ -11,7 +11,7 @@ Source: Witkin, Physically Based Modeling: Constrained Dynamics, SIGGRAPH 1997 c
 """
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -39,17 +39,6 @@ from diffrigid.pytree import array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, rotations
 
 STRONGEST = 1.2  # [-] rate of damping times a step; several on one body add up, and from 2.8 on Runge-Kutta is unstable
-
-
-def islands(ends: Iterable[tuple[int, int]], moving: int) -> tuple[tuple[int, ...], ...]:
-    """Moving bodies connected with each moving body by joints with these ends, itself included."""
-    together = [{body} for body in range(moving)]
-    for a, b in ends:
-        if a < moving and b < moving and together[a] is not together[b]:
-            together[a] |= together[b]
-            for body in together[b]:
-                together[body] = together[a]
-    return tuple(tuple(sorted(bodies)) for bodies in together)
 
 
 def ends_of(joints: Any) -> tuple[tuple[int, int], ...]:

@@ -175,7 +175,7 @@ def scene(
         forces=tuple(named_forces.values()), force_names=tuple(named_forces),
         joints=linked, joint_names=joint_names,
         contact=_contact(Contact() if contact is None else contact),
-        names=tuple(moving), static_names=tuple(still), **{f"own_{k}": own for k, (_, own) in material.items()},
+        names=tuple(moving), static_names=tuple(still), own=tuple((k, own) for k, (_, own) in material.items()),
     )  # fmt: skip
     start = _state(moving, dim)
     _warn_of_overlap(made, start, shapes, solids)

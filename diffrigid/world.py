@@ -56,11 +56,8 @@ class World:
     owners: tuple[tuple[int, ...], ...] = static()
     pairs: tuple[PairGroup, ...] = static()
     crowd: bool = static(default=False)  # so many bodies that pairs are found in every step instead of listed
-    own_restitution: tuple[bool, ...] = static()  # of each collider: given to it, not the scene's default
-    own_friction: tuple[bool, ...] = static()
-    own_restitution_falloff: tuple[bool, ...] = static(default=())
-    own_rolling_friction: tuple[bool, ...] = static(default=())
-    own_spinning_friction: tuple[bool, ...] = static(default=())
+    # of each coefficient, whether it was given to each collider itself, and is not the scene's default
+    own: tuple[tuple[str, tuple[bool, ...]], ...] = static()
 
     @property
     def dim(self) -> int:

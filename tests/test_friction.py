@@ -77,7 +77,7 @@ def on_tiles(up, normal, slope, v):
     return {"block": body, "left": next(tiles), "right": next(tiles)}, []
 
 
-@pytest.mark.parametrize("made", [welded, on_tiles])
+@pytest.mark.parametrize("made", [welded, pytest.param(on_tiles, marks=pytest.mark.slow)])
 def test_what_slides_as_one(made):
     """Two boxes that are welded, or one on two floors: up a slope, over the gap, to a stop within a step, and back."""
 

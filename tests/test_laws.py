@@ -150,7 +150,10 @@ GROUND = {  # below y = 0, or z = 0
 }
 
 
-@pytest.mark.parametrize("kind", GROUND)
+@pytest.mark.parametrize(
+    "kind",
+    ["box", "profile", *(pytest.param(k, marks=pytest.mark.slow) for k in GROUND if k not in ("box", "profile"))],
+)
 def test_what_is_round_and_smooth_strikes_as_if_it_did_not_spin(kind):
     """Slow impacts of a fast spin: w^2 r is far above gravity."""
     dim, shape, at = GROUND[kind]

@@ -93,7 +93,8 @@ def test_two_blocks_slide_as_one():
         np.testing.assert_allclose(slopes[name], np.broadcast_to(slope, (2, 2)), atol=1e-9)
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_what_begins_deep_inside_each_other_parts_gently(dtype):
     """Four boxes of 1 cm to 10 m and 1 g to 1 t in one heap, where no impulses, and no displacements, can do what their
     contacts ask for: they make next to no energy, and slopes are finite."""
@@ -121,6 +122,7 @@ def test_what_begins_deep_inside_each_other_parts_gently(dtype):
         assert jnp.isfinite(slope).all()
 
 
+@pytest.mark.slow
 def test_a_box_on_a_box_is_solved_at_any_speed():
     """Contacts that repeat each other, some stick and some slide: none closes, pulls, or rubs more than it may."""
     random, worlds = np.random.default_rng(0), 400

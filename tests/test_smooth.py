@@ -177,7 +177,7 @@ def passed(since, kind, width):
     return jnp.concatenate([end.v, end.w], axis=1)
 
 
-@pytest.mark.parametrize("kind", PATHS)
+@pytest.mark.parametrize("kind", ["disc and box", "two capsules", pytest.param("two boxes", marks=pytest.mark.slow)])
 def test_the_phase_of_the_step_does_not_matter(kind):
     """What is struck and how does not depend on where on their paths steps begin, nor do its slopes."""
 

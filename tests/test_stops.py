@@ -221,7 +221,7 @@ def test_mistakes_are_named(along, message):
         wheel(1.0, **along)
 
 
-@pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_limits_may_lie_beyond_half_a_turn(dim):
     """Where the angle of an orientation jumps nothing happens, and what has one limit turns a long way from it."""
     both, one = {"lower": -0.5, "upper": 4.0, "restitution": 0.6}, {"upper": 0.5, "restitution": 0.6}

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import diffrigid as dr
 
@@ -25,6 +26,7 @@ def thrown(seed):
     return world, state, dr.replace(change, q=q)
 
 
+@pytest.mark.slow
 def test_slopes_are_those_of_differences():
     """Contacts that repeat each other share their impulses in many ways; the motion and its slopes know of none.
 

@@ -6,6 +6,7 @@ from diffrigid.pytree import array, pytree
 
 ALERT = 4e-3  # [-] of the size: least gap of a feature that may be met within the step; above `NEAR` of the search
 FAR = 1e6  # [m] gap of features that cannot meet, and reach of unbounded shapes
+THERE = 0.5 * FAR  # [m] contacts with a smaller gap exist
 
 
 @pytree

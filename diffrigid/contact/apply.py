@@ -20,8 +20,9 @@ from diffrigid.contact.rolling import rolling_stops, with_rows
 from diffrigid.contact.sides import side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
+from diffrigid.elimination import islands
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
-from diffrigid.linkage import Linkage, ends_of, islands, linkage, spread
+from diffrigid.linkage import Linkage, ends_of, linkage, spread
 from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.pytree import replace
 from diffrigid.state import State, rotations

@@ -5,7 +5,7 @@ derivatives, and each body keeps its next one. The impacts of each world then go
 only these are evaluated.
 
 A pass goes this way if it is an impact pass and, in all worlds of the batch, no body is in two contacts at the
-same time, none comes to rest, and the slots suffice; else the general way, with the same result.
+same time, none comes to rest, none is smooth, and the slots suffice; else the general way, with the same result.
 """
 
 import functools

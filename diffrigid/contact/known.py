@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.branches import any_world
-from diffrigid.collide.contacts import FAR
+from diffrigid.collide.contacts import THERE
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
@@ -47,7 +47,7 @@ class Known:
 
     def there(self, strikes: Strikes) -> "Known":
         """Only the impulses of contacts that are still there: those of faces that were left have no arms."""
-        on = strikes.gap < 0.5 * FAR
+        on = strikes.gap < THERE
         turning_rows = len(self.P) - len(on)
         on = jnp.concatenate([on[:turning_rows], on]) if turning_rows else on
         return jax.tree.map(lambda leaf: jnp.where(on if leaf.ndim == on.ndim else on[:, None], leaf, 0.0), self)

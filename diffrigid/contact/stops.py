@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.constraints import by_twists
+from diffrigid.constraints import by_twists, poses
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.resting import Strikes
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
@@ -187,17 +187,10 @@ def _second(gap: Callable, s: Array) -> Array:
 
 def _with_statics(world: "World", flight: Flight) -> Flight:
     """The flights of all colliders: bodies, then statics and the world, which do not move."""
-    count = len(world.static_names) + 1
-    world_q = jnp.zeros_like(flight.q[:1]).at[:, 0].set(1.0)
+    count, every = len(world.static_names) + 1, poses(world.statics, flight.x, flight.q)
     still = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), flight)
-    x, q = (
-        jnp.concatenate([jnp.broadcast_to(leaf, (len(leaf), *like.shape[1:])), last])
-        for leaf, like, last in (
-            (world.statics.x, flight.x, jnp.zeros_like(flight.x[:1])),
-            (world.statics.q, flight.q, world_q),
-        )
-    )
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), flight, replace(still, x=x, q=q))
+    all_flights = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), flight, still)
+    return replace(all_flights, x=every.x, q=every.q)
 
 
 def _has(group: Any, kind: str) -> bool:

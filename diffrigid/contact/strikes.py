@@ -10,7 +10,7 @@ from jax import Array, lax
 
 from diffrigid.branches import any_world, opaque_true, unfused
 from diffrigid.collide import Contacts, PairGroup
-from diffrigid.collide.contacts import FAR
+from diffrigid.collide.contacts import THERE
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.held_up import held_up, is_supported
@@ -33,11 +33,12 @@ from diffrigid.contact.sides import (
     smaller_size,
 )
 from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
+from diffrigid.elimination import islands
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
 from diffrigid.gathers import constant, flags, rows
 from diffrigid.joints import Weld
-from diffrigid.linkage import ends_of, islands
+from diffrigid.linkage import ends_of
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Sphere
@@ -145,7 +146,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     fall = dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None)
     opened = jnp.where((held | meeting.joins)[None] | rested, fall[None], 0.0)
     near = gaps <= (meeting.level + meeting.slack)[None] + opened
-    there = gaps < 0.5 * FAR  # what rested may have left the face on which it did
+    there = gaps < THERE  # what rested may have left the face on which it did
     active = (near | (meeting.rests & held[None])) & there & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
@@ -246,7 +247,7 @@ def material(world: "World", name: str, colliders: tuple[int, ...]) -> Material:
     moving, still = getattr(world.bodies, name), getattr(world.statics, name)
     batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
     values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
-    own = getattr(world, f"own_{name}")
+    own = dict(world.own)[name]
     given = constant(tuple(float(own[i]) for i in colliders), str(values.dtype))
     return Material(value=rows(values, colliders), given=lax.expand_dims(given, range(1, values.ndim)))
 

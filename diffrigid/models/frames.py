@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 class Frame(NamedTuple):
@@ -17,33 +18,18 @@ class Frame(NamedTuple):
 
 
 def about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation about an axis of any length. Source: Rodrigues' formula."""
-    k = np.asarray(axis, float) / np.linalg.norm(axis)
-    cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    """Rotation about an axis of any length."""
+    return Rotation.from_rotvec(angle * np.asarray(axis, float) / np.linalg.norm(axis)).as_matrix()
 
 
 def from_quaternion(q: np.ndarray) -> np.ndarray:
     """Rotation of q = (w, x, y, z), of any length."""
-    s, *u = q / np.linalg.norm(q)
-    x, y, z = u
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + 2.0 * s * cross + 2.0 * cross @ cross
+    return Rotation.from_quat(np.roll(q, -1)).as_matrix()
 
 
 def to_quaternion(R: np.ndarray) -> np.ndarray:
-    """Quaternion (w, x, y, z), w >= 0: the eigenvector of Bar-Itzhack's matrix (2000), good for any rotation."""
-    (a, b, c), (d, e, f), (g, h, i) = R
-    K = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    q = np.linalg.eigh(K)[1][:, -1]
-    return q if q[0] >= 0 else -q
+    """Quaternion (w, x, y, z), w >= 0."""
+    return np.roll(Rotation.from_matrix(R).as_quat(canonical=True), 1)
 
 
 def from_euler(angles: np.ndarray, sequence: str) -> np.ndarray:

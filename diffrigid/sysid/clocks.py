@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import choose
 from diffrigid.flight import launch, state_at
 from diffrigid.state import State
 from diffrigid.step import advance
@@ -50,8 +51,7 @@ def states_at(world: World, states: State, lengths: Array, controls: Any, times:
     flight = launch(worlds, start, acting, jnp.zeros((start.x.shape[0], dt.shape[0]), dt.dtype), dt)
     earlier = state_at(flight, jnp.where(late, 0.0, missing).reshape(-1))
 
-    def choose(a: Array, b: Array) -> Array:
-        a = jnp.where(late.reshape((1,) * (a.ndim - 1) + (-1,)), a, b)
-        return jnp.moveaxis(a.reshape(*a.shape[:-1], len(times), lanes), -2, 0)
+    def by_time(leaf: Array) -> Array:
+        return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], len(times), lanes), -2, 0)
 
-    return jax.tree.map(choose, after, earlier)
+    return jax.tree.map(by_time, choose(late.reshape(-1), after, earlier))

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 from jax import Array
 
+from diffrigid.branches import choose
 from diffrigid.compiling import LASTING, uncollected
 from diffrigid.step import at_least_one
 from diffrigid.sysid.levenberg import INTERRUPTED, UNFINISHED, Numbers, Point, point_at
@@ -150,5 +151,4 @@ def _held(slope: Numbers, reach: Numbers) -> Numbers:
 def _best(old: tuple[Array, Numbers] | None, new: tuple[Array, Numbers]) -> tuple[Array, Numbers]:
     if old is None:
         return new
-    better = new[0] < old[0]
-    return jax.tree.map(lambda a, b: jnp.where(better.reshape((1,) * (a.ndim - 1) + (-1,)), a, b), new, old)
+    return choose(new[0] < old[0], new, old)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from diffrigid.branches import choose
 from diffrigid.compiling import QUICK
 from diffrigid.linear import einsum
 from diffrigid.sysid.problem import Group, linearise
@@ -108,7 +109,7 @@ def arrow(loss: Any, point: Point, members: tuple[tuple[int, ...], ...]) -> Arro
     rows, pulls = [], []
     for r, jac in zip(point.residuals, point.jacobians, strict=True):
         ok = jnp.isfinite(jac).all((0, 1)) & jnp.isfinite(r).all(0)
-        r, jac = _choose(ok, r, jnp.zeros_like(r)), _choose(ok, jac, jnp.zeros_like(jac))
+        r, jac = (choose(ok, leaf, jnp.zeros_like(leaf)) for leaf in (r, jac))
         weighted = jac * loss.weight(r)[:, None]
         rows.append(einsum("mirs,mjrs->rsij", weighted, jac))
         pulls.append(einsum("mirs,mrs->rsi", weighted, r))
@@ -184,9 +185,9 @@ def update(
 def _chosen(better: Array, whole: Array, new: Point, old: Point, members: tuple[tuple[int, ...], ...]) -> Point:
     """Select the new point where better (R, S), by record; its shared numbers where the whole start is, (S)."""
     rows = [better[np.asarray(group)] for group in members]
-    z = Numbers(_choose(whole, new.z.shared, old.z.shared), _choose(better, new.z.own, old.z.own))
-    r = [_choose(ok, a, b) for ok, a, b in zip(rows, new.residuals, old.residuals, strict=True)]
-    jac = [_choose(ok, a, b) for ok, a, b in zip(rows, new.jacobians, old.jacobians, strict=True)]
+    z = Numbers(choose(whole, new.z.shared, old.z.shared), choose(better, new.z.own, old.z.own))
+    r = [choose(ok, a, b) for ok, a, b in zip(rows, new.residuals, old.residuals, strict=True)]
+    jac = [choose(ok, a, b) for ok, a, b in zip(rows, new.jacobians, old.jacobians, strict=True)]
     return Point(z, tuple(r), tuple(jac))
 
 
@@ -194,11 +195,6 @@ def best_by_record(groups: Sequence[Group], point: Point, loss: Any) -> np.ndarr
     """The start with the lowest cost for each record, (R,)."""
     members = tuple(group.members for group in groups)
     return np.asarray(_in_order(members, [_costs(loss, r) for r in point.residuals])).argmin(1)
-
-
-def _choose(better: Array, new: Array, old: Array) -> Array:
-    """Select by the last axes."""
-    return jnp.where(better.reshape((1,) * (new.ndim - better.ndim) + better.shape), new, old)
 
 
 def _in_order(members: tuple[tuple[int, ...], ...], parts: Sequence[Array]) -> Array:

@@ -154,16 +154,12 @@ def _side_by_side(leaves: Sequence[Any]) -> np.ndarray:
 # ---- residuals
 
 
-def residuals(plan: Plan, z: Array, data: Data) -> Array:
+def _simulated(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
     """Weighted residuals (m, B) of B lanes z (n, B), over all devices; arrays of `data` have a last axis of 1 or B.
 
-    Rows of priors come last, shared among the records so that their squares sum to one prior.
+    Rows of priors come last, shared among the records so that their squares sum to one prior. Also the states
+    (S+1, ..., B) that they come from, which stay where they were computed.
     """
-    return _simulated(plan, z, data)[0]
-
-
-def _simulated(plan: Plan, z: Array, data: Data) -> tuple[Array, State]:
-    """Residuals, and the states (S+1, ..., B) that they come from, which stay where they were computed."""
     if len(devices()) == 1:
         return _simulated_here(plan, z, data)
     lanes, (leaves, tree) = z.shape[1], jax.tree.flatten((z, data))
@@ -246,7 +242,7 @@ def linearised(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
 def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
     """Residuals (m, R, S) at z (n, R, S), without derivatives; differentiable in both modes."""
     n, R, S = z.shape
-    return residuals(plan, z.reshape(n, -1), _spread(data, 1, S)).reshape(-1, R, S)
+    return _simulated(plan, z.reshape(n, -1), _spread(data, 1, S))[0].reshape(-1, R, S)
 
 
 def _compiled(fn: Callable) -> tuple[Callable, ...]:

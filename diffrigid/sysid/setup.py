@@ -6,7 +6,7 @@ scipy.optimize.least_squares(residuals, start_vector(problem), jacobian)
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -180,30 +180,26 @@ def _resumed(found: list[Run], saved: Any, free: Mapping[Any, Any], places: Sequ
 
 def first_numbers(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Numbers z of the values in the scenes: (a,), (b, R)."""
-    shared = [slot.kind.unbounded(np.asarray(_value(problem, slot))) for slot in problem.shared]
-    own = [
-        [slot.kind.unbounded(np.asarray(reference(slot, scene_of(run)))) for run in problem.runs]
-        for slot in problem.own
-    ]
-    return _joined(shared), np.concatenate([np.stack(rows, 1) for rows in own]) if own else np.zeros(
-        (0, len(problem.runs))
-    )
+    return _numbers(problem, lambda kind, value: kind.unbounded(value))
 
 
 def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
     """Starts: z of the values in the scenes, and of `count` - 1 random ones."""
-    random, (first, first_own) = np.random.default_rng(seed), first_numbers(problem)
-    shared, own = [first], [first_own]
-    for _ in range(count - 1):
-        shared.append(_joined([slot.kind.draw(np.asarray(_value(problem, slot)), random) for slot in problem.shared]))
-        rows = [
-            np.stack([slot.kind.draw(np.asarray(reference(slot, scene_of(run))), random) for run in problem.runs], 1)
-            for slot in problem.own
-        ]
-        own.append(np.concatenate(rows) if rows else first_own)
-    dtype = problem.runs[0].state.x.dtype
+    random, dtype = np.random.default_rng(seed), problem.runs[0].state.x.dtype
+    drawn = [_numbers(problem, lambda kind, value: kind.draw(value, random)) for _ in range(count - 1)]
+    shared_and_own = zip(first_numbers(problem), *drawn, strict=True)
     # Replicated on all devices, like what a solver returns: else all would be compiled again for that.
-    return everywhere(Numbers(*(jax.device_put(np.stack(rows, -1).astype(dtype)) for rows in (shared, own))))
+    return everywhere(Numbers(*(jax.device_put(np.stack(rows, -1).astype(dtype)) for rows in shared_and_own)))
+
+
+def _numbers(problem: Problem, of: Callable[[Any, np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers `of(kind, value in the scene)` of the shared parameters (a,) and of each record's own (b, R)."""
+    shared = [of(slot.kind, np.asarray(_value(problem, slot))) for slot in problem.shared]
+    own = [
+        np.stack([of(slot.kind, np.asarray(reference(slot, scene_of(run)))) for run in problem.runs], 1)
+        for slot in problem.own
+    ]
+    return _joined(shared), np.concatenate([np.zeros((0, len(problem.runs))), *own])
 
 
 def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
