@@ -10,6 +10,7 @@ from closed_form import with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid import so3
 from diffrigid.collide import COLLIDERS, CONVEX_2D, CONVEX_3D
 from diffrigid.overlap import place, separation
 from diffrigid.shapes import with_topology
@@ -113,3 +114,21 @@ def test_concentric_and_touching_poses_are_finite(dim, kind):
     both = jax.jit(with_slopes(gaps, jax.jacrev))
     for x in (jnp.zeros(dim), 1.2 * jnp.eye(dim)[0], 1.6 * jnp.eye(dim)[0], 0.6 * jnp.eye(dim)[1]):
         assert all(np.isfinite(leaf).all() for leaf in both(x))
+
+
+@pytest.mark.parametrize("height", [1e-6, 1e-9, -1e-9, -1e-7, -1e-6, -3e-6])
+def test_an_edge_that_comes_down_beside_a_corner_that_has_sunk_in_is_seen(height):
+    """A box stands on another with one corner, 2e-6 m inside; an edge of it crosses one of the other at `height`."""
+    high, low = dr.Box(half=jnp.array([0.4, 0.2, 0.1])), dr.Box(half=jnp.array([0.3, 0.3, 0.1]))
+    yaw = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
+    corner = np.array([-0.1, -0.1])
+    crosses, third = corner + 0.4 / yaw[0, 0] * yaw[:, 0], corner + 0.4 * yaw[:, 1]
+    z, dx, dy = np.linalg.solve([[1.0, *p] for p in (corner, crosses, third)], [-2e-6, height, 1e-3])  # its lower face
+    centre = corner + yaw @ (0.4, 0.2)
+    q = so3.compose(so3.exp(jnp.array([dy, -dx, 0.0])), so3.exp(jnp.array([0.0, 0.0, 0.5])))
+    x = jnp.array([*centre, z + centre @ (dx, dy)]) + so3.rotate(q, jnp.array([0.0, 0.0, 0.1]))
+    contacts = COLLIDERS[dr.Box, dr.Box](high, x, q, low, jnp.array([0.0, 0.0, -0.1]), jnp.eye(4)[0])
+    gap, normal, point = map(np.asarray, (contacts.gap, contacts.normal, contacts.point))
+    there = (np.linalg.norm(point - (*crosses, 0.0), axis=1) < 1e-3) & (normal[:, 2] > 0.99) & (gap < 1e-3)
+    assert there.sum() == 1
+    assert_allclose(gap[there], height, atol=1e-9)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from diffrigid import so3
@@ -17,6 +18,7 @@ from diffrigid.shapes import Capsule, edge_apexes, edges, radius
 
 CROSSINGS = 8  # at most: of two rectangles face to face
 PARALLEL = 1e-3  # [rad] edges closer to parallel than this do not cross
+DIP = 1e-2  # [-] of the smaller size: so little may a face dip into another, beside a corner that does
 ALIKE = 0.5  # cosine: contacts of convex bodies that touch have one normal, up to their penetration
 
 
@@ -43,7 +45,8 @@ def crossing_edges(
     size_a, size_b = edges_a.start.shape[1], edges_b.start.shape[1]
     down, across, margin = lax.stop_gradient((edges_a, edges_b, slack))
     down, across = Edges(*(leaf[:, :, None] for leaf in down)), Edges(*(leaf[:, None] for leaf in across))
-    order = _order(crossing(down, across, margin[None, None]), separated, margin[None, None])
+    deepest = lax.stop_gradient(contacts.gap.min(0) + radius(a) + radius(b))
+    order = _order(crossing(down, across, margin[None, None]), separated, margin[None, None], deepest[None, None])
     order = jnp.moveaxis(order.reshape(size_a * size_b, *slack.shape), 0, -1)
     count = (CROSSINGS, 2, 1)[isinstance(a, Capsule) + isinstance(b, Capsule)]
     nearest, index = (jnp.moveaxis(leaf, -1, 0) for leaf in lax.top_k(-order, count))
@@ -78,13 +81,14 @@ class Crossing(NamedTuple):
     on_a: Array  # (3, *batch) [m]
     on_b: Array
     within: Array  # (*batch) bool: both points are inside their edges
-    outermost: Array  # (*batch) bool: along the normal, both edges are the extremes of their shapes
+    lowest: Array  # (*batch) [m] how far a face beside an edge dips towards the other shape, negative
 
 
 def crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
     """Closest points of two lines, from 2 x 2 normal equations, and whether their shapes may touch there.
 
-    They may if the faces beside both edges fall away from the normal (arcs that cross in the Gauss map).
+    They do if the faces beside both edges fall away from the normal (arcs that cross in the Gauss map), so that along
+    it both edges are the extremes of their shapes.
     Source: Ericson, Real-Time Collision Detection, 5.1.9; Gregorius, The separating axis test, GDC 2013.
     """
     length_a, length_b, u_a, u_b = norm(a.along), norm(b.along), normalise(a.along), normalise(b.along)
@@ -102,18 +106,29 @@ def crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
     sign = jnp.where(towards >= 0, 1.0, -1.0).astype(n.dtype)
     lowest = jnp.minimum(jnp.minimum(sign * sides[0], sign * sides[1]), jnp.minimum(sign * sides[2], sign * sides[3]))
     n = sign[None] * n
-    return Crossing(dot(n, on_a - on_b), n, on_a, on_b, within, lowest >= -slack)
+    return Crossing(dot(n, on_a - on_b), n, on_a, on_b, within, lowest)
 
 
-def _order(c: Crossing, separated: Array, slack: Array) -> Array:
+def are_outermost(c: Crossing, deepest: Array, slack: Array) -> Array:
+    """Whether, along the normal, both edges of crossings are the extremes of their shapes, (E, E, *batch) bool.
+
+    They are so but for a dip where one face comes down on another beside a corner that is inside by more: the one with
+    the least gap, `deepest` [m].
+    """
+    dip = jnp.where(c.distance >= deepest, DIP / np.sqrt(np.finfo(slack.dtype).eps), 1.0).astype(slack.dtype) * slack
+    return c.lowest >= -dip
+
+
+def _order(c: Crossing, separated: Array, slack: Array, deepest: Array) -> Array:
     """How far the edges of all crossings are from touching, (E, E, *batch) [m]; FAR if they cannot touch.
 
     A positive distance is that of two points of the bodies, so it is no less than theirs. A negative one is
     penetration only if nothing separates the bodies.
     """
     apart = c.distance > slack
-    separated = separated | (c.within & c.outermost & apart).any((0, 1))
-    return jnp.where(c.within & (apart | (c.outermost & ~separated[None, None])), jnp.abs(c.distance), FAR)
+    separated = separated | (c.within & (c.lowest >= -slack) & apart).any((0, 1))
+    touches = are_outermost(c, deepest, slack) & ~separated[None, None]
+    return jnp.where(c.within & (apart | touches), jnp.abs(c.distance), FAR)
 
 
 def _along_contact(c: Crossing, contacts: Contacts, slack: Array) -> Array:

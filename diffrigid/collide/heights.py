@@ -25,7 +25,7 @@ from jax import Array, lax
 
 from diffrigid.collide.contacts import ALERT, FAR, Contacts
 from diffrigid.collide.distance import core_distance, reach
-from diffrigid.collide.edges import CROSSINGS, Edges, crossing, edges_of
+from diffrigid.collide.edges import CROSSINGS, Edges, are_outermost, crossing, edges_of
 from diffrigid.numerics import components, dot, norm, normalise, safe_divide
 from diffrigid.shapes import Capsule, HeightField, Sphere, edges, radius, vertices
 from diffrigid.so3 import cross
@@ -97,7 +97,9 @@ def _contacts(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array,
 
         count = CROSSINGS if len(edges(a, 3)) > 1 else 2
         peaks = some(_peaks(b, around, distance, slack, alert, radius(a)), PEAKS, None)
-        ridges = _nearest(_ridges(edges_of(a, corners - middle[None]), around, size, slack, radius(a)), count, None)
+        deepest = lax.stop_gradient(c.gap.min(0)) + radius(a)
+        own = edges_of(a, corners - middle[None])
+        ridges = _nearest(_ridges(own, around, deepest, size, slack, radius(a)), count, None)
         c = _joined(c, _moved(_joined(peaks, ridges), middle))
     normal, point = (jax.vmap(lambda r: so.rotate(q_b, r))(r) for r in (c.normal, c.point))
     return Contacts(gap=c.gap, normal=normal, point=point + x_b[None])
@@ -263,13 +265,14 @@ def _peaks(
     return jax.vmap(one, (1, 1, 2))(around.at(0, 0), up, _spokes(around))
 
 
-def _ridges(own: Edges, around: Around, size: Array, slack: Array, rounding: Array) -> Contacts:
+def _ridges(own: Edges, around: Around, deepest: Array, size: Array, slack: Array, rounding: Array) -> Contacts:
     """Contacts where edges of the body cross convex edges of the grid, both extreme along the common normal."""
     grid = _grid_edges(around)
     convex = dot(cross(grid.along, grid.left), grid.right)
     steep = slack[None] * norm(cross(grid.along, grid.left))
     c = crossing(Edges(*(r[:, :, None] for r in own)), Edges(*(r[:, None] for r in grid)), slack[None, None])
-    there = c.within & c.outermost & (c.distance > -0.5 * size[None, None]) & (c.normal[2] > 0)
+    outermost = are_outermost(c, deepest[None, None], slack[None, None])
+    there = c.within & outermost & (c.distance > -0.5 * size[None, None]) & (c.normal[2] > 0)
     gap = jnp.where(there & (convex < -steep)[None], c.distance - rounding[None, None], FAR)
     point = 0.5 * (c.on_a + c.on_b - rounding[None, None, None] * c.normal)
 
