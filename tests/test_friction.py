@@ -143,6 +143,25 @@ def test_a_box_that_spins_flat_on_a_floor():
     assert_allclose(slopes, jax.jacfwd(expected, (0, 1))(*p), atol=1e-7)
 
 
+def test_a_top_that_turns_stands_on_its_point():
+    """A hull that stands on a vertex with much friction, spins and precesses: the point stays, to second order."""
+    rim = [(0.3 * np.cos(t), 0.3 * np.sin(t), 0.5) for t in np.arange(3) * 2.0 * np.pi / 3.0]
+    top = dr.Body(dr.Hull(vertices=np.array([(0.0, 0.0, 0.0), *rim])), mass=1.0, inertia=(0.03, 0.035, 0.05))
+    ground = dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))
+    bodies = {"top": dr.replace(top, x=(0.0, 0.0, 1.0)), "ground": ground}
+    world, state = dr.scene(bodies, gravity=(0.0, 0.0, -G), friction=5.0)
+    q = so3.exp(jnp.array([0.1, 0.03, 0.0]))
+    point = world.offsets[0].r[0] + world.shapes[0].vertices[0, 0]  # from the centre of mass, body axes
+    arm, w = so3.rotate(q, point), so3.rotate(q, jnp.array([0.1, -0.2, 15.0]))
+    state = dr.replace(state, x=-arm[None], q=q[None], v=-so3.cross(w, arm)[None], w=w[None])
+
+    def slid(rate):
+        end = jax.tree.map(lambda leaf: leaf[-1, 0], dr.rollout(world, state, dt=1 / rate, steps=rate // 4).state)
+        return np.linalg.norm(end.x + so3.rotate(end.q, point))
+
+    assert slid(240) < 3e-4 and slid(960) < 0.1 * slid(240)
+
+
 @jax.jit
 @with_slopes
 def thrown(mu, v, t):

@@ -173,3 +173,27 @@ def test_mistakes_are_named():
         dr.scene(bodies, rolling_friction=-1.0)
     with pytest.raises(ValueError, match="in 2D nothing turns about a normal; give rolling_friction"):
         dr.scene(bodies, spinning_friction=0.1)
+
+
+def test_two_contacts_share_the_friction_against_turning():
+    """A capsule that lies on a floor and rolls sideways, or spins about the vertical: its way, and its turn."""
+    r, time, ground = 0.1, 0.4, {"floor": floor(3)}
+
+    def motion(c, w, spin, mu):
+        capsule = dr.Body(
+            dr.Capsule(radius=r, half_length=0.3), mass=MASS, inertia=(0.4 * MASS * r**2, 0.05, 0.05), x=(0.0, 0.0, r),
+            v=vector(0.0, -r * w, 0.0), w=vector(w, 0.0, spin),
+        )  # fmt: skip
+        kinds = {"rolling_friction": c, "spinning_friction": 2.0 * c}
+        world, state = dr.scene({"capsule": capsule} | ground, gravity=(0.0, 0.0, -G), friction=mu, **kinds)
+        end = jax.tree.map(lambda leaf: leaf[-1, 0], dr.rollout(world, state, dt=1 / 60, steps=24).state)
+        return jnp.stack([end.x[1], *(2.0 * jnp.arctan2(end.q[k], end.q[0]) for k in (1, 3))])
+
+    def expected(c, w, spin, mu):
+        del mu
+        rolled = w * time - jnp.sign(w) * 0.5 * c * G / (1.4 * r**2) * time**2
+        spun = spin * time - jnp.sign(spin) * 0.5 * 2.0 * c * MASS * G / 0.05 * time**2
+        return jnp.stack([-r * rolled, rolled, spun])
+
+    for case in ((0.005, 5.0, 0.0, 0.5), (0.005, 0.0, 3.0, 0.0)):
+        assert_allclose(motion(*map(jnp.asarray, case)), expected(*case), atol=EXACT)

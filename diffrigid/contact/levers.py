@@ -15,7 +15,7 @@ from jax import Array
 from diffrigid.branches import unfused
 from diffrigid.collide import Contacts
 from diffrigid.contact.sides import Placed, Side, contacts_of
-from diffrigid.flight import Flight
+from diffrigid.flight import Flight, angular_momentum
 from diffrigid.numerics import dot, safe_divide
 from diffrigid.pytree import array, pytree
 from diffrigid.state import rotations
@@ -98,10 +98,16 @@ def acceleration(f: Flight, at: Placed, s: Array, arm: Array) -> Array:
     return a + so.cross(so.apply(at.inverse_inertia, tau), arm)
 
 
-def coriolis(at: Placed, rate: Array) -> Array:
+def by_spin(f: Flight, at: Placed, s: Array, arm: Array, rate: Array) -> Array:
     """What a spin adds to the rate of a body's velocity where a contact moves along it, (D, *batch) [m/s^2].
 
+    That is w x (p' - v), and in space dw/dt x r, where w changes without a torque (Euler's equations).
+
     Args:
-        rate: (D, *batch) [m/s] velocity of the contact point.
+        rate: (D, *batch) [m/s] velocity p' of the contact point.
     """
-    return rotations(len(at.x)).cross(at.w, rate - at.v)
+    so = rotations(f.dim)
+    along = so.cross(at.w, rate - at.v)
+    if f.dim == 2:
+        return along
+    return along + so.cross(so.apply(at.inverse_inertia, so.precession(angular_momentum(f, s), at.w)), arm)

@@ -18,7 +18,7 @@ from diffrigid.contact.impulse import sticking_impulse
 from diffrigid.contact.mobility import Mobility, moved
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sides import at_colliders
-from diffrigid.contact.slipping import STICKS, lost_to_stops, stopping_early
+from diffrigid.contact.slipping import STICKS, in_all, lost_to_stops, stopping_early
 from diffrigid.contact.strikes import coefficients, contact_count
 from diffrigid.flight import Flight, angular_momentum
 from diffrigid.numerics import dot, norm, unit_vector
@@ -49,8 +49,10 @@ def with_rows(
         change = at_colliders(values, a, 0.0) - at_colliders(values, b, 0.0)
         return jnp.pad(change, [(0, 0), (0, so.D - so.A), *[(0, 0)] * len(batch)])
 
-    w = jax.vmap(so.apply)(mobility.inverse_inertia, jax.vmap(angular_momentum)(flight, t))
-    pull = jnp.zeros_like(w) if flight.tau is None else jax.vmap(so.apply)(mobility.inverse_inertia, flight.tau)
+    L = jax.vmap(angular_momentum)(flight, t)
+    w = jax.vmap(so.apply)(mobility.inverse_inertia, L)
+    tau = jax.vmap(so.precession)(L, w) + (0.0 if flight.tau is None else flight.tau)
+    pull = jax.vmap(so.apply)(mobility.inverse_inertia, tau)
     along = jax.vmap(lambda n: unit_vector(n, 0) if flat else n)(strikes.normal[:count])
     none = jnp.zeros_like(along)
     mid, turn = None if strikes.mid_a is None else none, None if strikes.turn is None else none[:, : so.A]
@@ -108,7 +110,8 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: A
     parts = [(_about, spin * load), (_across, turning(spin, mu) * load)]
     for part, bound in parts[: P.shape[1] - 1]:  # in the plane nothing is across
         slip, end, acting = (part(pair.normal, r) for r in (start, at_end, torque))
-        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound, bound)
+        of_all = in_all(pair, pair.active, bound)
+        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound, of_all)
     return _with_reaction(mobility, strikes, sticks, lost) + _of_slips(mobility, strikes, P, law, T)
 
 

@@ -16,7 +16,7 @@ from diffrigid.collide.profile import clearance
 from diffrigid.contact.held_up import held_up, is_supported
 from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix, restitution_at
-from diffrigid.contact.levers import acceleration, coriolis, levers, with_rates
+from diffrigid.contact.levers import acceleration, by_spin, levers, with_rates
 from diffrigid.contact.order import Links, Meeting, in_order
 from diffrigid.contact.resting import Strikes, are_alone
 from diffrigid.contact.sides import (
@@ -160,7 +160,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
         v_rel = relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b)
         pull = forces
         if moving is not None:
-            pull = pull + difference(coriolis, at_a, lever.rate, at_b, lever.rate)
+            pull = pull + difference(lambda at, of: by_spin(of[0], at, s, of[1], lever.rate), *sides)
             if turns:  # the normal velocity changes as the normal does, too
                 pull = pull + dot(moving.normal, v_rel)[None] * contact.normal
         return Strikes(
