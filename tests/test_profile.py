@@ -145,6 +145,26 @@ def test_what_slips_over_vertices_in_line_slips_as_on_a_plane(shape):
     assert_allclose(slopes, true_slopes, atol=EXACT)
 
 
+def test_a_slope_that_begins_beside_a_body_is_not_felt():
+    """Thrown boxes that come down, slip and tip on a level face beside one that rises by 0.001."""
+    flat = np.array([(-3.0, 0.0), (0.0, 0.0), (3.0, 0.0)])
+    level, beside = jnp.asarray(flat), jnp.asarray(flat + [(0.0, 3e-3), (0.0, 0.0), (0.0, 0.0)])
+    rng = np.random.default_rng(0)
+    x, v = rng.uniform((0.5, 0.4), (0.9, 0.7), (16, 2)), rng.uniform((-0.3, -1.0), (0.5, 0.0), (16, 2))
+
+    def path(points, x, v, w):
+        body = dr.Body(dr.Box(half=(0.2, 0.1)), mass=1.3, x=x, v=v, w=w)
+        bodies = {"body": body, "ground": dr.Static(dr.Profile(points=points))}
+        scene = dr.scene(bodies, gravity=(0.0, -G), restitution=0.5, friction=0.4)
+        return dr.rollout(*scene, dt=1 / 60, steps=45).state
+
+    both = jax.jit(jax.vmap(lambda *start: (path(level, *start), path(beside, *start))))
+    expected, got = both(*map(jnp.asarray, (x, v, rng.uniform(-4.0, 4.0, 16))))
+    stays = np.asarray(expected.x[:, :, 0, 0].min(1) > np.hypot(0.2, 0.1))
+    assert stays.sum() > 10
+    jax.tree.map(lambda a, b: assert_allclose(a[stays], b[stays], atol=1e-8), got, expected)
+
+
 VEE, ROOF = np.array([(-3.0, 2.1), (0.1, 0.0), (3.0, 1.2)]), np.array([(-3.0, -2.1), (0.1, 0.0), (3.0, -1.2)])
 
 

@@ -134,10 +134,12 @@ def _over_valley(along: Array, over: Array, before: Array, after: Array) -> Arra
     """Whether a corner is over a neighbour that makes a valley with a segment, (S, *batch) bool.
 
     There the line of the segment continues below the neighbour: a corner that reaches it has reached the valley, even
-    if it has fallen a little since it was last held.
+    if it has fallen a little since it was last held. Not between segments in line, on both of which it rests at once
+    (`on_next_segments`): it would be held by the line of the one as it falls past the other.
     """
     none = jnp.zeros_like(over[:1])
-    valley = jnp.concatenate([(jax.vmap(_cross)(along[:-1], along[1:]) > TURN) & ~none, none])  # at its end
+    rises, in_line = (jax.vmap(fn)(along[:-1], along[1:]) for fn in (_cross, dot))
+    valley = jnp.concatenate([(rises > 0) & (in_line < 1.0 - STRAIGHT) & ~none, none])  # at its end
     over_next = jnp.concatenate([over[1:], none])
     return (_shifted(over & valley) & (after <= 0)) | (over_next & valley & (before <= 0))
 
