@@ -10,27 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.branches import opaque_true
 from diffrigid.compiling import LASTING, QUICK, is_for_speed, is_own_program, uncollected
 from diffrigid.contact.crowd import without_room
-from diffrigid.contact.strikes import ends, is_rolling
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, largest, numbers
 from diffrigid.devices import on_cpu
-from diffrigid.flight import Flight, launch
-from diffrigid.linkage import onto_joints
-from diffrigid.numerics import FOUND, PASSED, saving, with_tangents
-from diffrigid.pytree import align, batch_rank
+from diffrigid.scan import MEMORY, advance, aligned, joined, scan_steps
 from diffrigid.shapes import traced
 from diffrigid.state import State
 from diffrigid.trajectory import Trajectory
 from diffrigid.world import World, check, check_kinds
 
-MEMORY = 2**31  # [bytes] of states that reverse mode saves before it rather computes steps again
 MUCH = 100_000_000  # [-] of `work`: beyond it a longer compilation pays
 A_BODY = 100  # work for a body or a joint, in numbers found by contacts
 CALLS = 3000  # expected number of calls of `step`
-WORLDS = 1024  # under `jax.vmap`: `memory` has room for so many worlds where the passes of one are saved
 
 
 @uncollected
@@ -200,37 +193,6 @@ def steps_in(gaps: np.ndarray, longest: Any) -> np.ndarray:
     return np.maximum(np.ceil(np.asarray(gaps, float) / np.asarray(longest, float) - 1e-3), 1).astype(int)
 
 
-def advance(world: World, state: State, dt: Array, controls: Any) -> State:
-    """Advance by one step, on arrays with aligned batch axes; dt (*batch)."""
-
-    def launch_from(state: State, t0: Array) -> Flight:
-        return launch(world, state, controls, t0, dt)
-
-    return joined(world, world.contact(world, state, launch_from, dt))
-
-
-def joined(world: World, state: State) -> State:
-    """Bring poses and velocities onto the joints: a start as it was given, and the end of a step."""
-    return onto_joints(world.joints, world.statics, world.bodies, state) if world.joints else state
-
-
-def aligned(world: World, state: State) -> tuple[World, State]:
-    """World and state with the same number of batch axes, and the state with all of the batch.
-
-    The world, too, has all of the batch where rows of joints or rolling rows are listed beside contacts.
-    """
-    rank = max(batch_rank(world), batch_rank(state))
-    world, state = align(world, rank), align(state, rank)
-    batches = [leaf.shape[leaf.ndim - rank :] for leaf in jax.tree.leaves((world, state))]
-    batch = np.broadcast_shapes(*batches)
-
-    def fill(leaf: Array) -> Array:
-        return jnp.broadcast_to(leaf, leaf.shape[: leaf.ndim - rank] + batch)
-
-    rows = (world.joints and ends(world)["a"]) or is_rolling(world)
-    return jax.tree.map(fill, world) if rows else world, jax.tree.map(fill, state)
-
-
 @jax.jit
 def _missed_jit(world, states, dt):
     return lax.map(lambda state: without_room(world, state, dt), states)
@@ -274,94 +236,3 @@ def _worlds(state: State) -> int:
 def work(world: World) -> int:
     """Estimate of the work of a step, in numbers found by its contacts."""
     return world.contact.saved_numbers(world) + A_BODY * (len(world.names) + sum(map(len, world.joint_names)))
-
-
-def scan_steps(
-    world: World, state: State, intervals: Array, controls: Any, counts: tuple[int, ...], memory: int = MEMORY
-) -> State:
-    """`state` and the states at the ends of intervals (T, *batch) [s]; interval k takes counts[k] equal steps."""
-    owner = np.repeat(np.arange(len(counts)), counts)
-    lengths = intervals[owner] / np.array(counts, intervals.dtype)[owner].reshape(-1, *[1] * (intervals.ndim - 1))
-    controls = jax.tree.map(lambda leaf: leaf[owner], controls)
-    one_step = fenced(world, saves_passes(world, state, len(owner), memory))
-
-    def record(state, inputs):
-        state = one_step(state, *inputs)
-        return state, state
-
-    state = joined(world, with_tangents(state, (world, intervals, controls)))
-    block = _block_length(state, len(owner), memory)
-    _, states = _blocked_scan(record, state, (lengths, controls), len(owner), block)
-    ends = np.cumsum(counts) - 1
-    if len(owner) != len(counts):
-        states = jax.tree.map(lambda leaf: leaf[ends], states)
-    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, states)
-
-
-def final_state(world: World, state: State, dt: Array, controls: Any, steps: int, memory: int) -> State:
-    """State after `steps` steps of dt (), without the ones between; controls have an axis of `steps` in front."""
-    one_step = fenced(world, saves_passes(world, state, steps, memory))
-
-    def record(state, inputs):
-        return one_step(state, *inputs), None
-
-    state, lengths = joined(world, with_tangents(state, (world, dt, controls))), jnp.full((steps,), dt)
-    return _blocked_scan(record, state, (lengths, controls), steps, _block_length(state, steps, memory))[0]
-
-
-def fenced(world: World, saves: bool):
-    """`advance`, which reverse mode recomputes from the state; on a CPU behind a `lax.cond` that is always true.
-
-    If it `saves` what the passes of a step find and hand on, each pass is recomputed from that.
-
-    Without the condition XLA fuses the read of the saved state into every loop of the backward step, which then
-    does not vectorise and costs several times as much.
-    """
-
-    again = saving(*(FOUND, PASSED) * saves)
-
-    @again
-    def one_step(state: State, dt: Array, controls: Any) -> State:
-        @again
-        def stepped(state):
-            return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
-
-        if not on_cpu():
-            return stepped(state)
-        return lax.cond(opaque_true(dt), stepped, lambda state: state, state)
-
-    return one_step
-
-
-def saves_passes(world: World, state: State, steps: int, memory: int) -> bool:
-    """Whether reverse mode saves the passes of all steps: for one world, if they take little of `memory` [bytes].
-
-    In a batch they would not stay in the cache.
-    """
-    if state.x.ndim > 2 or world.crowd:
-        return False
-    return steps * world.contact.saved_numbers(world) * state.x.dtype.itemsize * WORLDS <= memory
-
-
-def _block_length(state: State, steps: int, memory: int) -> int:
-    """Number of steps between saved states: 1 while all fit into `memory` [bytes], else about sqrt(steps)."""
-    saved = steps * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-    return 1 if saved <= memory else int(np.sqrt(steps))
-
-
-def _blocked_scan(record, state, inputs, steps: int, block: int):
-    """lax.scan whose reverse pass keeps the state at every `block` steps and recomputes the rest."""
-    if block <= 1:
-        return lax.scan(record, state, inputs)
-    whole = steps // block * block
-
-    def split(leaf):
-        return leaf[:whole].reshape(whole // block, block, *leaf.shape[1:])
-
-    inner = jax.checkpoint(lambda state, inputs: lax.scan(record, state, inputs), prevent_cse=False)
-    state, states = lax.scan(inner, state, jax.tree.map(split, inputs))
-    states = jax.tree.map(lambda leaf: leaf.reshape(whole, *leaf.shape[2:]), states)
-    if whole < steps:
-        state, rest = lax.scan(record, state, jax.tree.map(lambda leaf: leaf[whole:], inputs))
-        states = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), states, rest)
-    return state, states

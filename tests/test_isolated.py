@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.contact import isolated
-from diffrigid.step import MEMORY
+from diffrigid.scan import MEMORY
 
 STEPS = 24
 OTHER = MEMORY - 1  # as much, but another program: it is traced anew

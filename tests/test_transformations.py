@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.pytree import pytree
-from diffrigid.step import ROLLOUT, STEP, WORLDS, floats
+from diffrigid.scan import WORLDS
+from diffrigid.step import ROLLOUT, STEP, floats
 
 ROUNDING = 1e-11  # absolute, of values about 1: the same operations in another order
 EXACT = 1e-9  # relative: rounding of a few hundred steps

@@ -5,8 +5,8 @@ To read it, in the order of a step; `model.py` first, which runs the passes:
     where paths begin     anchors.py
     when shapes meet      impact.py; a search (search.py, approach.py, nearing.py, gaps.py) where there is
                           no closed form; what rests is held up meanwhile (held_up.py, supported.py)
-    all of them           strikes.py lists the contacts, with coefficients, stops.py the rows of joints, rolling.py
-                          those against turning; sides.py sums over the pairs of each body
+    all of them           strikes.py lists the contacts, materials.py has their coefficients, stops.py the rows of
+                          joints, rolling.py those against turning; sums.py adds up over the contacts of each body
     whose turn it is      order.py
     one contact           impulse.py
     many at once          resting.py, together.py (the law in cone.py, its derivative in slope.py, bodies in

@@ -17,9 +17,9 @@ from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, rela
 from diffrigid.contact.order import over_islands
 from diffrigid.contact.resting import Law, Strikes, barely, solve_impulses
 from diffrigid.contact.rolling import rolling_stops, with_rows
-from diffrigid.contact.sides import side_sum
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
+from diffrigid.contact.sums import side_sum
 from diffrigid.elimination import islands
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.linkage import Linkage, ends_of, linkage, spread

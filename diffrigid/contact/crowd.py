@@ -23,8 +23,9 @@ from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.grid import Near, neighbours, pick
 from diffrigid.contact.impact import approach
 from diffrigid.contact.impulse import impulses
+from diffrigid.contact.materials import Material, law, materials
 from diffrigid.contact.sides import Side
-from diffrigid.contact.strikes import Material, law, materials, next_strikes
+from diffrigid.contact.strikes import next_strikes
 from diffrigid.flight import launch, orientation, state_at
 from diffrigid.gathers import rows
 from diffrigid.numerics import FOUND, dot, norm

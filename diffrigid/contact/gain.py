@@ -20,7 +20,7 @@ from diffrigid.contact.cone import Cone
 from diffrigid.contact.impulse import within_energy
 from diffrigid.contact.mobility import Arms, Mobility, moved
 from diffrigid.contact.order import Links, hanging_together
-from diffrigid.contact.sides import at_pairs, pair_sum, pairs_of
+from diffrigid.contact.sums import at_pairs, pair_sum, pairs_of
 from diffrigid.contact.together import solve_together
 from diffrigid.numerics import FOUND, dot, saving
 from diffrigid.pytree import replace

@@ -21,9 +21,10 @@ from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
 from diffrigid.contact.impulse import comes_to_rest, restitution_at
+from diffrigid.contact.materials import materials, mixed
 from diffrigid.contact.sides import Side
 from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, sum_of_terms, summed
-from diffrigid.contact.strikes import is_rolling, materials, mixed, relative_path_is_straight
+from diffrigid.contact.strikes import is_rolling, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
 from diffrigid.gathers import constant, fold

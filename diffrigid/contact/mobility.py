@@ -14,7 +14,7 @@ from jax import Array
 
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.contact.cone import put
-from diffrigid.contact.sides import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
+from diffrigid.contact.sums import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
 from diffrigid.gathers import sum_rows
 from diffrigid.linear import identity, matvec
 from diffrigid.linkage import Linkage, damped_later, is_damped, spread

@@ -31,7 +31,6 @@ from diffrigid.contact.impulse import comes_to_rest, restitution_at
 from diffrigid.contact.isolated import goes_in_rounds, isolated_impacts
 from diffrigid.contact.known import Known
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.sides import at_colliders
 from diffrigid.contact.strikes import (
     coefficients,
     contact_count,
@@ -44,6 +43,7 @@ from diffrigid.contact.strikes import (
     may_meet,
     waits,
 )
+from diffrigid.contact.sums import at_colliders
 from diffrigid.contact.supported import find_supported, matters
 from diffrigid.flight import Flight, state_at
 from diffrigid.gathers import flags

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.branches import any_world
-from diffrigid.contact.sides import at_colliders, body_sides
+from diffrigid.contact.sums import at_colliders, body_sides
 from diffrigid.gathers import rows
 from diffrigid.pytree import array, pytree, replace
 

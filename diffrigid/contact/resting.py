@@ -10,7 +10,7 @@ from diffrigid.contact.cone import Cone
 from diffrigid.contact.gain import solve_without_gain
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.mobility import Arms, Mobility
-from diffrigid.contact.sides import at_colliders
+from diffrigid.contact.sums import at_colliders
 from diffrigid.gathers import flags
 from diffrigid.numerics import safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static

@@ -17,9 +17,9 @@ from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.impulse import sticking_impulse
 from diffrigid.contact.mobility import Mobility, moved
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.sides import at_colliders
 from diffrigid.contact.slipping import STICKS, in_all, lost_to_stops, stopping_early
 from diffrigid.contact.strikes import coefficients, contact_count
+from diffrigid.contact.sums import at_colliders
 from diffrigid.flight import Flight, angular_momentum
 from diffrigid.numerics import dot, norm, unit_vector
 from diffrigid.pytree import replace

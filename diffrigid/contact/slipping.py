@@ -10,7 +10,7 @@ from jax import Array
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, momentum_changes
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.sides import alike, at_colliders
+from diffrigid.contact.sums import alike, at_colliders
 from diffrigid.gathers import constant, sum_rows
 from diffrigid.numerics import dot, norm, safe_divide
 from diffrigid.pytree import replace

@@ -16,9 +16,10 @@ from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.impulse import impulses
+from diffrigid.contact.materials import law, materials
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
-from diffrigid.contact.strikes import law, materials, next_strikes
+from diffrigid.contact.strikes import next_strikes
 from diffrigid.flight import Flight, orientation
 from diffrigid.gathers import fold, pack
 from diffrigid.numerics import dot

@@ -15,8 +15,9 @@ from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.held_up import held_up, is_supported
 from diffrigid.contact.impact import find_impact
-from diffrigid.contact.impulse import effective_matrix, restitution_at
+from diffrigid.contact.impulse import effective_matrix
 from diffrigid.contact.levers import acceleration, by_spin, levers, with_rates
+from diffrigid.contact.materials import material, mixed
 from diffrigid.contact.order import Links, Meeting, in_order
 from diffrigid.contact.resting import Strikes, are_alone
 from diffrigid.contact.sides import (
@@ -36,11 +37,11 @@ from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, 
 from diffrigid.elimination import islands
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
-from diffrigid.gathers import constant, flags, rows
+from diffrigid.gathers import flags
 from diffrigid.joints import Weld
 from diffrigid.linkage import ends_of
 from diffrigid.numerics import dot, norm
-from diffrigid.pytree import array, pytree, replace
+from diffrigid.pytree import replace
 from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Sphere
 from diffrigid.state import rotations
 
@@ -234,40 +235,6 @@ def wholes(world: "World") -> tuple:
     return tuple(map(label, both[:count])) + tuple(("joint", *ends) for ends in both[count:])
 
 
-@pytree
-class Material:
-    """Values of one material coefficient for M colliders."""
-
-    value: Array = array("M")  # (M, *batch) [-]
-    given: Array = array("M")  # (M, *batch) 1 if it was given to the collider itself, 0 if it is the scene's
-
-
-def material(world: "World", name: str, colliders: tuple[int, ...]) -> Material:
-    """Look up the coefficient `name` for the given colliders."""
-    moving, still = getattr(world.bodies, name), getattr(world.statics, name)
-    batch = jnp.broadcast_shapes(moving.shape[1:], still.shape[1:])
-    values = jnp.concatenate([jnp.broadcast_to(x, x.shape[:1] + batch) for x in (moving, still)])
-    own = dict(world.own)[name]
-    given = constant(tuple(float(own[i]) for i in colliders), str(values.dtype))
-    return Material(value=rows(values, colliders), given=lax.expand_dims(given, range(1, values.ndim)))
-
-
-LAW = ("restitution", "friction", "restitution_falloff")
-
-
-def materials(world: "World", colliders: tuple[int, ...], names: tuple[str, ...] = LAW) -> list[Material]:
-    """Look up those of `names` that the world has; by default the coefficients that `law` takes."""
-    return [material(world, name, colliders) for name in names if getattr(world.bodies, name) is not None]
-
-
-def law(a: list[Material], b: list[Material], strike: Strikes) -> tuple[Array, Array]:
-    """Coefficients of restitution and friction between two colliders at their impact."""
-    e, mu, *falloff = map(mixed, a, b)
-    if falloff:
-        e = restitution_at(-jax.vmap(dot)(strike.normal, strike.v_rel), e, *falloff)
-    return e, mu
-
-
 def coefficients(world: "World", name: str, batch: tuple[int, ...]) -> Array:
     """Coefficient `name` of all contacts and rows of joints, (C, *batch) or broadcastable to it."""
     index = {side: ends(world)[side][: contact_count(world)] for side in "ab"}
@@ -309,8 +276,3 @@ def driving(world: "World", target: Array) -> tuple[Array, Array | None]:
 def contact_count(world: "World") -> int:
     """Number of contacts of all pairs, without the rows of joints."""
     return sum(len(pairs.a) * pairs.count for pairs in world.pairs)
-
-
-def mixed(a: Material, b: Material) -> Array:
-    """Mean of the coefficients of two colliders; one given to a collider itself outweighs the scene's."""
-    return 0.5 * ((1.0 + a.given - b.given) * a.value + (1.0 + b.given - a.given) * b.value)

@@ -12,8 +12,9 @@ from diffrigid.branches import opaque_true
 from diffrigid.contact.approach import resting, task_of
 from diffrigid.contact.gaps import gaps_at
 from diffrigid.contact.impact import closed_form, round_rests
-from diffrigid.contact.sides import Side, earliest, have_faces, side_sum, sides_of
+from diffrigid.contact.sides import Side, earliest, have_faces, sides_of
 from diffrigid.contact.strikes import relative_path_is_straight
+from diffrigid.contact.sums import side_sum
 from diffrigid.flight import Flight
 
 if TYPE_CHECKING:

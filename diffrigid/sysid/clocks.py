@@ -8,8 +8,8 @@ from jax import Array, lax
 
 from diffrigid.branches import choose
 from diffrigid.flight import launch, state_at
+from diffrigid.scan import advance
 from diffrigid.state import State
-from diffrigid.step import advance
 from diffrigid.world import World
 
 

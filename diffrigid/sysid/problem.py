@@ -20,8 +20,9 @@ from jax import Array
 from diffrigid.compiling import LASTING, QUICK, uncollected
 from diffrigid.devices import cut, devices, everywhere, join, on_cpu, over_devices, pieces_of
 from diffrigid.pytree import replace
+from diffrigid.scan import aligned, scan_steps
 from diffrigid.state import State
-from diffrigid.step import aligned, scan_steps, work
+from diffrigid.step import work
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
 from diffrigid.sysid.records import Run, Series
