@@ -42,7 +42,9 @@ def joints_of(
         refuse_missing(joint, name)
         for side in ("a", "b"):
             body = getattr(joint, side)
-            if (not isinstance(body, str) or body not in colliders) and (side == "a" or body is not None):
+            if side == "a" and body is None:
+                raise ValueError(f"{name}.a is None: expected a body; name it first, and None, for the world, second.")
+            if body is not None and (not isinstance(body, str) or body not in colliders):
                 raise ValueError(f"{name}.{side} is {body!r}, which is not a body: {nearest(body, colliders)}")
         if joint.a not in moving and joint.b not in moving:
             raise ValueError(f"{name} joins {joint.a!r} to {joint.b!r}: expected one that moves; name a Body.")

@@ -14,7 +14,7 @@ from diffrigid.devices import on_cpu
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import FOUND, PASSED, saving, with_tangents
-from diffrigid.pytree import align, batch_rank
+from diffrigid.pytree import align, batch_rank, replace
 from diffrigid.state import State
 from diffrigid.world import World
 
@@ -39,8 +39,13 @@ def joined(world: World, state: State) -> State:
 def aligned(world: World, state: State) -> tuple[World, State]:
     """World and state with the same number of batch axes, and the state with all of the batch.
 
-    The world, too, has all of the batch where rows of joints or rolling rows are listed beside contacts.
+    The world, too, has all of the batch where rows of joints or rolling rows are listed beside contacts. Inertias are
+    made symmetric here, so that they are whatever entry is changed, and have symmetric gradients.
     """
+    if world.dim == 3:
+        inertia = world.bodies.inertia
+        inertia = 0.5 * (inertia + jnp.swapaxes(inertia, 1, 2))
+        world = replace(world, bodies=replace(world.bodies, inertia=inertia))
     rank = max(batch_rank(world), batch_rank(state))
     world, state = align(world, rank), align(state, rank)
     batches = [leaf.shape[leaf.ndim - rank :] for leaf in jax.tree.leaves((world, state))]

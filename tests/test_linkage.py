@@ -114,3 +114,23 @@ def test_a_loop_swings_as_the_pendulum_that_it_is():
     got, slope = jax.jit(lambda m: jax.jvp(end, (m,), (1.0,)))(1.5)
     assert_allclose(got, exact(1.5), atol=1e-6)
     assert_allclose(slope, (exact(1.5 + 1e-4) - exact(1.5 - 1e-4)) / 2e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+def test_the_slope_by_one_entry_of_an_inertia_is_that_of_the_motion(mode):
+    """Also by an entry whose mirror image stays: only the symmetric part acts."""
+    inertia = np.diag([0.05, 0.06, 0.08]) + 0.01 * np.array([(0.0, 1.0, -1.0), (1.0, 0.0, 0.5), (-1.0, 0.5, 0.0)])
+    bodies = {"arm": dr.Body(None, mass=1.0, inertia=inertia, x=(0.0, 0.0, 0.0), w=(0.6, -0.2, -0.4))}
+    world, state = dr.scene(bodies, gravity=(0.0, 1.0, -9.81), joints=[dr.Ball("arm", None, anchor_a=(-0.3, 0.1, 0.2))])
+
+    @jax.jit
+    def end(inertia):
+        changed = dr.replace(world, bodies=dr.replace(world.bodies, inertia=inertia[None]))
+        state_after = dr.rollout(changed, state, dt=1 / 60, steps=10).state
+        return jnp.concatenate([state_after.q[-1, 0], state_after.w[-1, 0]])
+
+    by_entry = jax.jit(mode(end))(jnp.asarray(inertia))
+    steps = 1e-5 * np.eye(9).reshape(9, 3, 3)
+    differences = [(end(inertia + step) - end(inertia - step)) / 2e-5 for step in steps]
+    assert_allclose(by_entry.reshape(-1, 9).T, differences, atol=1e-8)
+    assert_allclose(by_entry, jnp.swapaxes(by_entry, 1, 2), atol=1e-12)
