@@ -3,7 +3,7 @@
 To read it, in the order of a fit; `fit.py` runs it:
 
     what was measured     records.py, sensors.py, times.py
-    what is free          free.py (kinds), parameters.py (where they are); losses.py
+    what is free          free.py, charts.py (kinds), parameters.py (where they are); losses.py
     the problem           setup.py, problem.py (from z to residuals), clocks.py, points.py (back)
     solvers               levenberg.py, gradient.py; segments.py for long records
     how sure              covariance.py, profile.py, sampling.py, diagnosis.py, remarks.py, orders.py
@@ -14,11 +14,12 @@ Letters of array axes: K rows of a column, M numbers of a column, R records, S s
 of each record, m residuals.
 """
 
+from diffrigid.sysid.charts import direction, inertia, rotation, shares
 from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
 from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
 from diffrigid.sysid.figures import correlation_figure, cost_figure, profile_figure, residual_figure
 from diffrigid.sysid.fit import fit
-from diffrigid.sysid.free import Free, direction, each, inertia, interval, positive, prior, real, rotation, shares
+from diffrigid.sysid.free import Free, each, interval, positive, prior, real
 from diffrigid.sysid.gradient import first_order, lbfgs
 from diffrigid.sysid.losses import huber, squares, student
 from diffrigid.sysid.profile import profile, with_profiles

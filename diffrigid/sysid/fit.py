@@ -10,8 +10,9 @@ import numpy as np
 from diffrigid.convert import numbers
 from diffrigid.state import State
 from diffrigid.step import at_least_one
+from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
-from diffrigid.sysid.free import Chart, Each, Free, Prior
+from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.levenberg import INTERRUPTED, Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders

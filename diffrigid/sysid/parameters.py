@@ -14,7 +14,8 @@ from jax import Array
 
 from diffrigid import paths
 from diffrigid.state import State
-from diffrigid.sysid.free import Chart, Each, Free, Kind, Prior
+from diffrigid.sysid.charts import Chart
+from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.sensors import Channel, channel_paths, read_channel, write_channel
 from diffrigid.world import World
 
@@ -33,7 +34,7 @@ class Slot:
 
     name: str
     paths: tuple[str, ...]
-    kind: Kind
+    kind: Free | Chart
     size: int  # numbers of z
     prior: Prior | None = None
 

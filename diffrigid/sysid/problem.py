@@ -9,7 +9,6 @@ arguments of the program: another record of the same shape costs no compilation.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -215,7 +214,7 @@ def _prior_rows(plan: Plan, scene: Scene, z: Array) -> list[Array]:
     first = jax.tree.map(lambda leaf: leaf[..., 0], scene)
     for slot, piece, share in zip(plan.slots, split(plan.slots, z), plan.priors, strict=True):
         if slot.prior is not None:
-            value = jax.vmap(partial(slot.kind.value, reference=reference(slot, first)), -1, -1)(piece)
+            value = jax.vmap(slot.kind.value, (-1, None), -1)(piece, reference(slot, first))
             value = value.reshape(-1, z.shape[1])
             mean, deviation = (jnp.asarray(p, z.dtype)[:, None] for p in (slot.prior.mean, slot.prior.deviation))
             rows.append(share * (value - mean) / deviation)

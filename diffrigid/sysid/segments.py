@@ -24,8 +24,9 @@ import numpy as np
 from diffrigid import paths
 from diffrigid.state import State, rotations
 from diffrigid.step import at_least_one
+from diffrigid.sysid.charts import rotation
 from diffrigid.sysid.fit import fit
-from diffrigid.sysid.free import Each, each, real, rotation
+from diffrigid.sysid.free import Each, each, real
 from diffrigid.sysid.records import Record, Series, columns
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.sensors import Part
