@@ -7,7 +7,7 @@ To read it, in the order of a fit; `fit.py` runs it:
     the problem           setup.py, problem.py (from z to residuals), clocks.py, points.py (back)
     solvers               levenberg.py, gradient.py; segments.py for long records
     how sure              covariance.py, profile.py, sampling.py, diagnosis.py, remarks.py, orders.py
-    what comes out        result.py, summary.py, table.py, figures.py
+    what comes out        result.py, intervals.py, summary.py, table.py, figures.py
     before measuring      design.py
 
 Letters of array axes: K rows of a column, M numbers of a column, R records, S starts, a shared numbers z, b numbers z

@@ -10,12 +10,12 @@ import numpy as np
 from diffrigid.state import State
 from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
 from diffrigid.sysid.diagnosis import Blind, blind_directions, coordinates, infinite_where_blind
+from diffrigid.sysid.intervals import interval_of, pieces, references, unit_of, unseen_of
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import make_slots, put, reference
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.records import Record
-from diffrigid.sysid.result import interval_of, pieces, references, unit_of, unseen_of
 from diffrigid.sysid.setup import Problem, first_numbers, make_problem, make_starts, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.world import World

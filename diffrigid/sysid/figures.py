@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 
 from diffrigid.sysid.diagnosis import correlations
+from diffrigid.sysid.intervals import number_names
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import Profile
-from diffrigid.sysid.result import Fit, number_names
+from diffrigid.sysid.result import Fit
 
 
 def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:

@@ -13,6 +13,7 @@ from diffrigid.step import at_least_one
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
 from diffrigid.sysid.free import Each, Free, Prior
+from diffrigid.sysid.intervals import describe
 from diffrigid.sysid.levenberg import INTERRUPTED, Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
@@ -20,7 +21,7 @@ from diffrigid.sysid.parameters import split
 from diffrigid.sysid.points import by_column, linear_of, row_mask
 from diffrigid.sysid.records import check_mapping
 from diffrigid.sysid.remarks import remarks_on
-from diffrigid.sysid.result import Fit, describe
+from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import (
     LEAST,
     Problem,

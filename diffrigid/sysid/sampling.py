@@ -22,10 +22,11 @@ from diffrigid.compiling import LASTING, uncollected
 from diffrigid.step import at_least_one
 from diffrigid.sysid.covariance import inverse
 from diffrigid.sysid.diagnosis import coordinates
+from diffrigid.sysid.intervals import references, unit_of
 from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of
 from diffrigid.sysid.parameters import Slot, reference, split
 from diffrigid.sysid.problem import Data, Plan, linearised
-from diffrigid.sysid.result import Fit, references, unit_of
+from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import Problem, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import rows_of
