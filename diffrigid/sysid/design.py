@@ -10,10 +10,10 @@ import numpy as np
 from diffrigid.state import State
 from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
 from diffrigid.sysid.diagnosis import Blind, blind_directions, coordinates, infinite_where_blind
-from diffrigid.sysid.intervals import interval_of, pieces, references, unit_of, unseen_of
+from diffrigid.sysid.intervals import coordinates_of, interval_of, unit_of, unseen_of
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.parameters import make_slots, put, reference
+from diffrigid.sysid.parameters import make_slots, pieces, put, reference
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.records import Record
 from diffrigid.sysid.setup import Problem, first_numbers, make_problem, make_starts, scene_of
@@ -71,8 +71,7 @@ def blind_spots(
     """
     problem = make_problem(world, state, observations, free=free, noise=noise, observe=observe, dt=dt)
     linear = linear_of(problem, point_at(problem.groups, make_starts(problem, 1, 0)), 0, Squares(), False)
-    places = coordinates((*problem.shared, *problem.own), references(problem))
-    return tuple(blind.words for blind in blind_directions(linear, places))
+    return tuple(blind.words for blind in blind_directions(linear, coordinates_of(problem)))
 
 
 def best_launch(
@@ -153,8 +152,9 @@ def _linears(problem: Problem) -> list[Linear]:
 
 def _blind(problem: Problem, record: int, linear: Linear) -> list[Blind]:
     """Directions of z that a record does not determine."""
-    slots, scene = (*problem.shared, *problem.own), scene_of(problem.runs[record])
-    return blind_directions(linear, coordinates(slots, [np.asarray(reference(slot, scene)) for slot in slots]))
+    scene = scene_of(problem.runs[record])
+    values = [np.asarray(reference(slot, scene)) for slot in problem.slots]
+    return blind_directions(linear, coordinates(problem.slots, values))
 
 
 def _covariance(problem: Problem, record: int, linear: Linear) -> np.ndarray:

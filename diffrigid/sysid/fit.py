@@ -17,7 +17,7 @@ from diffrigid.sysid.intervals import describe
 from diffrigid.sysid.levenberg import INTERRUPTED, Point, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
-from diffrigid.sysid.parameters import split
+from diffrigid.sysid.parameters import pieces
 from diffrigid.sysid.points import by_column, linear_of, row_mask
 from diffrigid.sysid.records import check_mapping
 from diffrigid.sysid.remarks import remarks_on
@@ -262,8 +262,8 @@ def _all_noise(problem: Problem) -> dict[str, float]:
 def _refuse_blind(problem: Problem, linear: Linear) -> None:
     """Raise ValueError for a parameter that no residual depends on, instead of a number with an infinite interval."""
     sizes = sum((slopes**2).sum(0) for slopes in linear.slopes)
-    for slot, size in zip((*problem.shared, *problem.own), split((*problem.shared, *problem.own), sizes), strict=True):
-        if not np.any(size > 0):
+    for slot, rows in pieces(problem.slots):
+        if not np.any(sizes[rows] > 0):
             raise ValueError(
                 f"free: nothing that was measured depends on {slot.name} at the best fit: "
                 "leave it out, or give a record that shows it: an impact for restitution, one that slips for friction. "

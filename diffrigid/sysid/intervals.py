@@ -12,6 +12,7 @@ from diffrigid.paths import component, unit
 from diffrigid.sysid.covariance import Linear, Uncertainty, own_covariance
 from diffrigid.sysid.diagnosis import (
     Blind,
+    Coordinate,
     blind_directions,
     coordinates,
     correlations,
@@ -21,8 +22,8 @@ from diffrigid.sysid.diagnosis import (
 )
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.parameters import Slot, reference
-from diffrigid.sysid.setup import Problem, scene_having, scene_of
+from diffrigid.sysid.parameters import Slot, pieces, reference
+from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import BLIND
 
@@ -35,7 +36,7 @@ def describe(
     residuals: tuple[dict[str, np.ndarray], ...], loss: Any,
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """Parameters with intervals, and the notes under the table."""
-    places = coordinates((*problem.shared, *problem.own), references(problem))
+    places = coordinates_of(problem)
     blind = blind_directions(linear, places)
     quantile = float(stdtrit(uncertainty.freedom, 0.975))
     covariance = infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared))
@@ -60,27 +61,21 @@ def describe(
     return tuple(parameters), tuple(notes)
 
 
-def references(problem: Problem) -> list[np.ndarray]:
-    """Value of each parameter in the scene of the first record that has it."""
-    return [np.asarray(reference(slot, scene_having(problem, slot))) for slot in (*problem.shared, *problem.own)]
+def coordinates_of(problem: Problem) -> list[Coordinate]:
+    """Coordinates of all numbers of z, in order."""
+    return coordinates(problem.slots, [np.asarray(first_value(problem, slot)) for slot in problem.slots])
 
 
 def number_names(problem: Problem) -> list[str]:
     """Names of the shared numbers of z, in order."""
-    return [place.name for place in coordinates(problem.shared, references(problem)[: len(problem.shared)])]
-
-
-def pieces(slots: tuple[Slot, ...], first: int = 0) -> list[tuple[Slot, slice]]:
-    """Slices of z that belong to each parameter, from `first` on."""
-    ends = np.cumsum([first, *(slot.size for slot in slots)])
-    return [(slot, slice(*pair)) for slot, *pair in zip(slots, ends[:-1], ends[1:], strict=True)]
+    return [place.name for place in coordinates_of(problem)[: problem.sizes[0]]]
 
 
 def _shared_parameter(
     problem: Problem, slot: Slot, z: np.ndarray, covariance: np.ndarray, quantile: float, blind: Sequence[Blind],
     rows: slice,
 ) -> Parameter:  # fmt: skip
-    about = reference(slot, scene_having(problem, slot))
+    about = first_value(problem, slot)
     value, low, high = interval_of(slot, z, covariance, about, quantile, unseen_of(blind, rows))
     return Parameter(slot.name, value, low, high, unit_of(problem, slot), _note(slot, value, blind))
 

@@ -71,10 +71,15 @@ def reference(slot: Slot, scene: Scene) -> Array:
     return read(scene, slot.paths[0])
 
 
+def pieces(slots: Sequence[Slot], first: int = 0) -> list[tuple[Slot, slice]]:
+    """Each slot and its rows of z, which are counted from `first` on."""
+    ends = np.cumsum([first, *(slot.size for slot in slots)])
+    return [(slot, slice(*pair)) for slot, *pair in zip(slots, ends[:-1], ends[1:], strict=True)]
+
+
 def split(slots: Sequence[Slot], z: Any) -> list[Any]:
     """Split z (n, ...) into pieces, one for each slot."""
-    ends = np.cumsum([0, *(slot.size for slot in slots)])
-    return [z[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [z[rows] for _, rows in pieces(slots)]
 
 
 def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:

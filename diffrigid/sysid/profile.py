@@ -135,13 +135,13 @@ def _index(fit: Fit, name: str) -> int:
 def _costs(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
     """Lowest cost for each held value, as many at once as the fit had starts, so that nothing is recompiled."""
     count = fit.starts.shape[1]
-    dtype = fit.problem.runs[0].state.x.dtype
     reach, out = reach_of(fit.problem, [index]), []
     for first in range(0, len(z), count):
         held = np.resize(z[first : first + count], count)
         shared = np.repeat(fit.shared[:, None], count, axis=1)
         shared[index] = held
-        start = Numbers(jnp.asarray(shared, dtype), jnp.asarray(np.repeat(fit.own[..., None], count, axis=-1), dtype))
+        own = np.repeat(fit.own[..., None], count, axis=-1)
+        start = Numbers(*(jnp.asarray(part, fit.problem.dtype) for part in (shared, own)))
         point, _ = levenberg(fit.problem.groups, start, fit.loss, 30, reach, lambda count, costs: None)
         out.append(np.asarray(cost_of(fit.loss, point.residuals), float))
     return np.concatenate(out)[: len(z)]

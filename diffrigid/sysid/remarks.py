@@ -82,7 +82,7 @@ def _torn(scene: Scene) -> list[str]:
 def _light_inertia(problem: Problem, scene: Scene) -> list[str]:
     """Remarks on solid bodies whose mass has changed in the fit, but not their inertia."""
     before, after = problem.runs[0], scene.world
-    paths = {path for slot in (*problem.shared, *problem.own) for path in slot.paths}
+    paths = {path for slot in problem.slots for path in slot.paths}
     out = []
     for i, name in enumerate(after.names):
         if f"{name}.mass" not in paths or f"{name}.density" not in catalogue(after):

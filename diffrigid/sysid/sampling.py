@@ -21,13 +21,12 @@ from jax import Array
 from diffrigid.compiling import LASTING, uncollected
 from diffrigid.step import at_least_one
 from diffrigid.sysid.covariance import inverse
-from diffrigid.sysid.diagnosis import coordinates
-from diffrigid.sysid.intervals import references, unit_of
+from diffrigid.sysid.intervals import coordinates_of, unit_of
 from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of
 from diffrigid.sysid.parameters import Slot, reference, split
 from diffrigid.sysid.problem import Data, Plan, linearised
 from diffrigid.sysid.result import Fit
-from diffrigid.sysid.setup import Problem, scene_of
+from diffrigid.sysid.setup import Problem, first_value, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import rows_of
 from diffrigid.tables import lined_up
@@ -85,12 +84,12 @@ def sample(fit: Fit, draws: int = 1000, *, chains: int = 4, warmup: int = 300, s
         at_least_one(name, count)
     if chains < 2 or draws < 4:
         raise ValueError(f"sample: {chains} chains of {draws} draws, expected two or more of four or more, to compare")
-    problem, dtype = fit.problem, fit.problem.runs[0].state.x.dtype
+    problem, dtype = fit.problem, fit.problem.dtype
     about, covariance = np.concatenate([fit.shared, fit.own.T.ravel()]), _covariance(fit)
     random = np.random.default_rng(seed)
     first = about + random.standard_normal((chains, len(about))) @ np.linalg.cholesky(covariance).T
     parts = tuple((group.plan, group.members) for group in problem.groups)
-    refer = [jnp.asarray(about, dtype) for about in references(problem)[: len(problem.shared)]]
+    refer = [first_value(problem, slot) for slot in problem.shared]
     refer_own = [_of_records(problem, slot) for slot in problem.own]
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as blackjax relies on
         z, divergent = _chains(
@@ -122,8 +121,7 @@ def _covariance(fit: Fit) -> np.ndarray:
     """Covariance of all z, (n, n), finite also where the data tell nothing: a large change of each is a prior."""
     linear, problem = fit.linear, fit.problem
     (a, b), records = problem.sizes, len(problem.runs)
-    places = coordinates((*problem.shared, *problem.own), references(problem))
-    large = np.array([place.scale for place in places])
+    large = np.array([place.scale for place in coordinates_of(problem)])
     information = np.diag(1.0 / np.concatenate([large[:a], np.tile(large[a:], records)]) ** 2)
     for k, slopes in enumerate(linear.slopes):
         at = np.concatenate([np.arange(a), a + k * b + np.arange(b)])
@@ -218,7 +216,7 @@ def _side_by_side(parts: Sequence[tuple[Plan, tuple[int, ...]]], loss: Any, a: i
 
 def _posterior(fit: Fit, values: dict[str, np.ndarray], divergent: int) -> Posterior:
     problem = fit.problem
-    slots = {slot.name: slot for slot in (*problem.shared, *problem.own)}
+    slots = {slot.name: slot for slot in problem.slots}
     parameters, r_hat, size = [], {}, {}
     for name, value in values.items():
         low, high = np.quantile(value, (0.025, 0.975), axis=(0, 1))

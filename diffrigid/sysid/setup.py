@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from diffrigid.convert import numbers
 from diffrigid.devices import everywhere
@@ -47,9 +48,19 @@ class Problem:
     observe: Mapping[str, Any]  # likewise
 
     @property
+    def slots(self) -> tuple[Slot, ...]:
+        """All free parameters, in the order of z."""
+        return (*self.shared, *self.own)
+
+    @property
     def sizes(self) -> tuple[int, int]:
         """Shared numbers a, and numbers b of each record."""
         return sum(slot.size for slot in self.shared), sum(slot.size for slot in self.own)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Precision of the simulation."""
+        return self.runs[0].state.x.dtype
 
 
 def make_problem(
@@ -185,16 +196,16 @@ def first_numbers(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
     """Starts: z of the values in the scenes, and of `count` - 1 random ones."""
-    random, dtype = np.random.default_rng(seed), problem.runs[0].state.x.dtype
+    random = np.random.default_rng(seed)
     drawn = [_numbers(problem, lambda kind, value: kind.draw(value, random)) for _ in range(count - 1)]
     shared_and_own = zip(first_numbers(problem), *drawn, strict=True)
     # Replicated on all devices, like what a solver returns: else all would be compiled again for that.
-    return everywhere(Numbers(*(jax.device_put(np.stack(rows, -1).astype(dtype)) for rows in shared_and_own)))
+    return everywhere(Numbers(*(jax.device_put(np.stack(rows, -1).astype(problem.dtype)) for rows in shared_and_own)))
 
 
 def _numbers(problem: Problem, of: Callable[[Any, np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Numbers `of(kind, value in the scene)` of the shared parameters (a,) and of each record's own (b, R)."""
-    shared = [of(slot.kind, np.asarray(_value(problem, slot))) for slot in problem.shared]
+    shared = [of(slot.kind, np.asarray(first_value(problem, slot))) for slot in problem.shared]
     own = [
         np.stack([of(slot.kind, np.asarray(reference(slot, scene_of(run)))) for run in problem.runs], 1)
         for slot in problem.own
@@ -204,18 +215,17 @@ def _numbers(problem: Problem, of: Callable[[Any, np.ndarray], np.ndarray]) -> t
 
 def reach_of(problem: Problem, held: Sequence[int] = ()) -> Numbers:
     """Longest step of each number: a factor e^2 for those of which z is a logarithm or similar; 0 if held."""
-    dtype = problem.runs[0].state.x.dtype
     parts = []
     for slots in (problem.shared, problem.own):
         real = [isinstance(slot.kind, Free) and np.isinf(slot.kind.low) for slot in slots]
         parts.append(_joined([np.full(slot.size, np.inf if r else 2.0) for slot, r in zip(slots, real, strict=True)]))
     parts[0][list(held)] = 0.0
-    a, b = (part.astype(dtype) for part in parts)
+    a, b = (part.astype(problem.dtype) for part in parts)
     return Numbers(jax.device_put(a[:, None]), jax.device_put(b[:, None, None]))
 
 
-def _value(problem: Problem, slot: Slot) -> Any:
-    """Reference value of a parameter: that of the first record that has it."""
+def first_value(problem: Problem, slot: Slot) -> Array:
+    """Value of a parameter in the scene of the first record that has it."""
     return reference(slot, scene_having(problem, slot))
 
 
@@ -241,9 +251,8 @@ def start_vector(problem: Problem) -> np.ndarray:
 def unpack(problem: Problem, z: np.ndarray) -> Numbers:
     """Unpack a vector (a + R b,) as one start."""
     a, b = problem.sizes
-    dtype = problem.runs[0].state.x.dtype
     own = np.asarray(z[a:]).reshape(len(problem.runs), b).T
-    return Numbers(jnp.asarray(z[:a], dtype)[:, None], jnp.asarray(own, dtype)[:, :, None])
+    return Numbers(jnp.asarray(z[:a], problem.dtype)[:, None], jnp.asarray(own, problem.dtype)[:, :, None])
 
 
 def residual_vector(problem: Problem, z: np.ndarray) -> np.ndarray:
