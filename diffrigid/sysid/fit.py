@@ -213,10 +213,10 @@ def _lost(problem: Problem, linear: Linear) -> dict[str, float]:
     lost = dict.fromkeys(problem.noise, 0.0)
     shared = inverse(information(linear))
     for group in problem.groups:
+        columns = np.concatenate([np.full(w.shape[0] * w.shape[1], n) for n, w in group.data.weights.items()])
         for k, member in enumerate(group.members):
             hat = leverages(linear, member, shared)
-            rows = row_mask(problem, group, k, sum(w.shape[0] * w.shape[1] for w in group.data.weights.values()))[0]
-            names = np.concatenate([np.full(w.shape[0] * w.shape[1], n) for n, w in group.data.weights.items()])[rows]
+            names = columns[row_mask(problem, group, k, len(columns))[0]]
             for name in lost:
                 lost[name] += float(hat[: len(names)][names == name].sum())
     return lost

@@ -11,7 +11,7 @@ import numpy as np
 
 from diffrigid.impacts import order_of_impacts
 from diffrigid.sysid.levenberg import Numbers
-from diffrigid.sysid.problem import LOOKED_AT, linearise
+from diffrigid.sysid.problem import LOOKED_AT, linearise, of_record
 from diffrigid.sysid.records import SAME
 from diffrigid.sysid.setup import Problem, fitted_scene
 from diffrigid.sysid.times import controls_over
@@ -36,8 +36,8 @@ def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
             continue
         states = jax.tree.map(np.asarray, linearise(group.plan, z.of(group.members), group.data)[2])
         for k in chosen:
-            run, lengths = problem.runs[group.members[k]], np.asarray(group.data.lengths, float)
-            t = np.concatenate([[0.0], np.cumsum(lengths[:, k if lengths.shape[1] > 1 else 0])])
+            run = problem.runs[group.members[k]]
+            t = np.concatenate([[0.0], np.cumsum(of_record(group.data.lengths, k), dtype=float)])
             end = max(series.t[-1] for series in run.series) - run.start
             t = t[t <= end + SAME]  # shorter records are padded
             controls = controls_over(run, run.start + t[:-1])

@@ -9,7 +9,8 @@ import numpy as np
 from diffrigid.sysid.covariance import Linear
 from diffrigid.sysid.levenberg import Point
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.problem import Group
+from diffrigid.sysid.problem import Group, of_record
+from diffrigid.sysid.records import series_of
 from diffrigid.sysid.setup import Problem
 
 
@@ -42,9 +43,9 @@ def row_mask(problem: Problem, group: Group, k: int, rows: int) -> tuple[np.ndar
     """Whether rows of record k of a group are measured (or those of a prior), and their times (m,)."""
     use, times = [], []
     for name, weights in group.data.weights.items():
-        w = np.asarray(weights)[..., k if weights.shape[-1] > 1 else 0]
+        w = of_record(weights, k)
         t = np.zeros(len(w))
-        series = next(s for s in problem.runs[group.members[k]].series if s.name == name)
+        series = series_of(problem.runs[group.members[k]], name)
         t[: len(series.t)] = series.t
         use.append((w > 0).ravel())
         times.append(np.repeat(t, w.shape[1]))
@@ -61,7 +62,7 @@ def by_column(problem: Problem, point: Point, best: int, in_units: bool = False)
         for k, member in enumerate(group.members):
             first, found = 0, {}
             for name, weights in group.data.weights.items():
-                w = np.asarray(weights)[..., k if weights.shape[-1] > 1 else 0]
+                w = of_record(weights, k)
                 piece = values[first : first + w.size, k].reshape(w.shape)
                 found[name] = np.where(w > 0, piece / (np.where(w > 0, w, 1.0) if in_units else 1.0), np.nan)
                 first += w.size

@@ -24,7 +24,7 @@ from diffrigid.state import State
 from diffrigid.step import work
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
-from diffrigid.sysid.records import Run, Series
+from diffrigid.sysid.records import Run, series_of
 from diffrigid.sysid.sensors import Part, difference, is_angle
 from diffrigid.sysid.times import controls_over, grid
 
@@ -97,18 +97,18 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
     lengths = [np.concatenate([a, np.full(steps - len(a), longest)]) for a, _ in grids]
     acting = [controls_over(run, run.start + np.cumsum(h) - h) for run, h in zip(found, lengths, strict=True)]
     names = list(found[0].channels)
-    rows = {name: max(len(_series(run, name).t) for run in found) for name in names}
+    rows = {name: max(len(series_of(run, name).t) for run in found) for name in names}
 
-    def stacked(make):
+    def stacked(make, names=names):
         return {name: _side_by_side([_padded(make(k, name), rows[name]) for k in range(len(found))]) for name in names}
 
     data = Data(
         scene=jax.tree.map(lambda *leaves: _side_by_side(leaves), *scenes),
         lengths=_side_by_side(lengths),
         rows=stacked(lambda k, name: grids[k][1][name]),
-        times={k: v for k, v in stacked(lambda k, n: _series(found[k], n).t - found[k].start).items() if k in clocked},
+        times=stacked(lambda k, name: series_of(found[k], name).t - found[k].start, clocked),
         controls=jax.tree.map(lambda *values: _side_by_side(values), *acting),
-        measured=stacked(lambda k, name: np.nan_to_num(_series(found[k], name).values)),
+        measured=stacked(lambda k, name: np.nan_to_num(series_of(found[k], name).values)),
         weights=stacked(lambda k, name: known(found[k], name).astype(float)),
         width=None,
     )
@@ -121,13 +121,9 @@ def _absent(slot: Slot) -> Slot:
     return Slot(slot.name, (), slot.kind, slot.size)
 
 
-def _series(run: Run, name: str) -> Series:
-    return next(series for series in run.series if series.name == name)
-
-
 def known(run: Run, name: str) -> np.ndarray:
     """Whether residuals of a column are measured, (K, size of the residual) bool."""
-    finite = np.isfinite(_series(run, name).values)
+    finite = np.isfinite(series_of(run, name).values)
     observer = run.channels[name].observer
     if not (isinstance(observer, Part) and observer.field == "q"):
         return finite
@@ -149,6 +145,11 @@ def _side_by_side(leaves: Sequence[Any]) -> np.ndarray:
     leaves = [np.asarray(leaf) for leaf in leaves]
     alike = all(leaf is leaves[0] or np.array_equal(leaf, leaves[0]) for leaf in leaves)
     return np.stack(leaves[:1] if alike else leaves, axis=-1)
+
+
+def of_record(array: Any, k: int) -> np.ndarray:
+    """Record k of an array of a group, whose last axis is 1 where all records are equal."""
+    return np.asarray(array)[..., k if array.shape[-1] > 1 else 0]
 
 
 # ---- residuals

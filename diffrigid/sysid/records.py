@@ -65,6 +65,11 @@ class Run:
     controls: tuple[Series, ...] = ()  # each held from one of its times to the next
 
 
+def series_of(run: Run, name: str) -> Series:
+    """The measured column of this name."""
+    return next(series for series in run.series if series.name == name)
+
+
 def runs(world: World, state: State, observations: Any, observe: Mapping[str, Any], noise: Mapping | None) -> list[Run]:
     """Read and check all records of a fit.
 

@@ -24,7 +24,7 @@ from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers
 from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
 from diffrigid.sysid.problem import Group, evaluate, full_turn, known, linearise, make_groups
-from diffrigid.sysid.records import Run, noise_guess, runs
+from diffrigid.sysid.records import Run, noise_guess, runs, series_of
 from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
 
@@ -142,7 +142,7 @@ def with_noise(
 def _weights(run: Run, name: str, noise: Mapping[str, float], window: float, rows: int) -> np.ndarray:
     """1 / standard deviation, (rows, size), 0 where missing, beyond the window, or padded."""
     here = known(run, name)
-    series = next(s for s in run.series if s.name == name)
+    series = series_of(run, name)
     sigma = np.asarray(numbers(f"noise[{name!r}]", run.noise.get(name, noise.get(name, 1.0)), None, finite=False))
     sigma = sigma[:, None] if sigma.ndim == 1 and len(sigma) == len(here) else sigma
     try:
