@@ -1,6 +1,7 @@
 """Free parameters of a scene: where each is, and how a vector z of numbers is written into the scene.
 
-Numbers that all records share come first in z, then those of which each record has its own.
+Paths are those of `diffrigid.paths`, COLUMN.field for what `sensors` says of a column, and "clock" for the clock of all
+columns. Numbers that all records share come first in z, then those of which each record has its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,10 +14,11 @@ import numpy as np
 from jax import Array
 
 from diffrigid import paths
+from diffrigid.pytree import array_fields, replace
 from diffrigid.state import State
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.free import Each, Free, Prior
-from diffrigid.sysid.sensors import Channel, channel_paths, read_channel, write_channel
+from diffrigid.sysid.sensors import Channel, is_turn
 from diffrigid.world import World
 
 
@@ -46,22 +48,58 @@ class Slot:
 
 def read(scene: Scene, path: str) -> Array:
     """Value of a parameter of the world, the initial state, or a column."""
-    if path in channel_paths(scene.channels):
-        return read_channel(scene.channels, path)
-    return paths.read(scene.world, scene.state, path)
+    of_columns = channel_paths(scene.channels)
+    if path not in of_columns:
+        return paths.read(scene.world, scene.state, path)
+    node: Any = scene.channels
+    for key in of_columns[path][0]:
+        node = _child(node, key)
+    return jnp.asarray(node)
 
 
 def write(scene: Scene, path: str, value: Array) -> Scene:
     """The scene with one parameter changed."""
-    if path in channel_paths(scene.channels):
-        return scene._replace(channels=write_channel(scene.channels, path, value))
-    world, state = paths.write(scene.world, scene.state, path, value)
-    return scene._replace(world=world, state=state)
+    of_columns, channels = channel_paths(scene.channels), scene.channels
+    if path not in of_columns:
+        return Scene(*paths.write(scene.world, scene.state, path, value), channels)
+    for chain in of_columns[path]:
+        channels = _updated(channels, chain, value)
+    return scene._replace(channels=channels)
 
 
 def knows(scene: Scene, path: str) -> bool:
     """Whether the scene has such a parameter."""
     return path in channel_paths(scene.channels) or paths.component(path)[0] in paths.catalogue(scene.world)
+
+
+def channel_paths(channels: dict[str, Channel]) -> dict[str, list[tuple[str, ...]]]:
+    """Every path of the columns, and the chains of attributes that it stands for."""
+    out: dict[str, list[tuple[str, ...]]] = {"clock": [(name, "clock") for name in channels]}
+    for name, channel in channels.items():
+        fields = ("clock",) if is_turn(channel) else ("bias", "scale", "clock")
+        out |= {f"{name}.{field}": [(name, field)] for field in fields}
+        out |= {f"{name}.{'.'.join(chain)}": [(name, "observer", *chain)] for chain in _leaves(channel.observer)}
+    return out
+
+
+def _leaves(observer: Any) -> list[tuple[str, ...]]:
+    """Chains of attributes to the float leaves of an observer, and of those that it is made of."""
+    chains: list[tuple[str, ...]] = [(field,) for field in array_fields(observer)]
+    for key in ("of", "a", "b"):
+        if hasattr(observer, key):
+            chains += [(key, *chain) for chain in _leaves(getattr(observer, key))]
+    return chains
+
+
+def _child(node: Any, key: str) -> Any:
+    return node[key] if isinstance(node, dict) else getattr(node, key)
+
+
+def _updated(node: Any, chain: tuple[str, ...], value: Array) -> Any:
+    key, rest = chain[0], chain[1:]
+    child = _child(node, key)
+    child = _updated(child, rest, value) if rest else jnp.reshape(value, jnp.shape(child))
+    return {**node, key: child} if isinstance(node, dict) else replace(node, **{key: child})
 
 
 def reference(slot: Slot, scene: Scene) -> Array:
@@ -84,13 +122,11 @@ def split(slots: Sequence[Slot], z: Any) -> list[Any]:
 
 def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
     """Write the parameters for z (n,) into the scene."""
-    used = [(slot, piece) for slot, piece in zip(slots, split(slots, z), strict=True) if slot.paths]
-    values = [slot.kind.value(piece, reference(slot, scene)) for slot, piece in used]
-    numbers = [
-        (path, value[k] if slot.joint else value)
-        for (slot, _), value in zip(used, values, strict=True)
-        for k, path in enumerate(slot.paths)
-    ]
+    numbers: list[tuple[str, Array]] = []
+    for slot, rows in pieces(slots):
+        if slot.paths:
+            value = slot.kind.value(z[rows], reference(slot, scene))
+            numbers += [(path, value[k] if slot.joint else value) for k, path in enumerate(slot.paths)]
     # Bodies are moved along joints when anchors and velocities are as they will be.
     for path, value in sorted(numbers, key=lambda number: paths.order_of(scene.world, number[0])):
         scene = write(scene, path, value)
@@ -101,8 +137,8 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
     """Make slots of the parameters that all records share, and of those of which each record has its own.
 
     Raises:
-        ValueError: nothing is free, a kind is none, a path is in no scene, two name the same numbers, or the value in
-            a scene is none that the kind allows.
+        ValueError: nothing is free, a value of `free` is not a kind, a path is in no scene, two paths set the same
+            number, or the kind does not allow the value in a scene.
     """
     if not isinstance(free, Mapping) or not free:
         raise ValueError('free: nothing to fit; give paths, for example {"restitution": interval(0, 1)}')
@@ -111,45 +147,47 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
     shared: list[Slot] = []
     own: list[Slot] = []
     for key, kind in free.items():
-        names = (key,) if isinstance(key, str) else tuple(key) if isinstance(key, tuple | list) else ()
-        if not names or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"free has the key {key!r}: expected a path such as 'ball.mass', or a tuple of paths")
         several = isinstance(kind, Each)
-        kind = kind.kind if isinstance(kind, Each) else kind
-        known = kind if isinstance(kind, Prior) else None
-        kind = kind.kind if isinstance(kind, Prior) else kind
-        if not isinstance(kind, Free | Chart):
-            raise ValueError(
-                f"free[{key!r}]: expected interval(low, high), positive(), real() or another kind, got {kind!r}"
-            )
-        having = [scene for scene in scenes if all(knows(scene, name) for name in names)]
-        if not having or several and len(having) < len(scenes):
-            _refuse(names, having, scenes)
-        _refuse_ambiguous(names, unlike)
-        slot = Slot(" = ".join(names), names, kind, 0, known)
-        shape = reference(slot, having[0]).shape
-        size = kind.size(shape)
-        whole = paths.component(names[0])[0]
-        if isinstance(kind, Free) and whole.endswith(".inertia") and having[0].world.dim == 3:
-            raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
-        for scene in having:
-            kind.check(f"free[{key!r}]", np.asarray(reference(slot, scene)))
-        if known is not None and len(known.mean) not in (1, int(np.prod(shape))):
-            raise ValueError(
-                f"free[{key!r}]: a prior with {len(known.mean)} means, expected those of the shape {shape}"
-            )
-        name = slot.name.replace(" = ", " : ") if slot.joint else slot.name
-        (own if several else shared).append(Slot(name, names, kind, size, known))
+        slot = _make_slot(key, kind.kind if several else kind, several, scenes, unlike)
+        (own if several else shared).append(slot)
     for scene in unlike:
         _refuse_overlaps([*shared, *own], scene)
     return tuple(shared), tuple(own)
+
+
+def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unlike: Sequence[Scene]) -> Slot:
+    """Check one entry of `free`; one scene of each structure is in `unlike`."""
+    names = (key,) if isinstance(key, str) else tuple(key) if isinstance(key, tuple | list) else ()
+    if not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"free has the key {key!r}: expected a path such as 'ball.mass', or a tuple of paths")
+    prior, kind = (kind, kind.kind) if isinstance(kind, Prior) else (None, kind)
+    if not isinstance(kind, Free | Chart):
+        raise ValueError(
+            f"free[{key!r}]: expected interval(low, high), positive(), real() or another kind, got {kind!r}"
+        )
+    having = [scene for scene in scenes if all(knows(scene, name) for name in names)]
+    if not having or several and len(having) < len(scenes):
+        _refuse(names, having, scenes)
+    _refuse_ambiguous(names, unlike)
+    slot = Slot(" = ".join(names), names, kind, 0, prior)
+    if slot.joint:
+        slot = replace(slot, name=" : ".join(names))
+    shape = reference(slot, having[0]).shape
+    size = kind.size(shape)
+    if isinstance(kind, Free) and paths.component(names[0])[0].endswith(".inertia") and having[0].world.dim == 3:
+        raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
+    for scene in having:
+        kind.check(f"free[{key!r}]", np.asarray(reference(slot, scene)))
+    if prior is not None and len(prior.mean) not in (1, int(np.prod(shape))):
+        raise ValueError(f"free[{key!r}]: a prior with {len(prior.mean)} means, expected those of the shape {shape}")
+    return replace(slot, size=size)
 
 
 def _refuse_ambiguous(names: tuple[str, ...], scenes: Sequence[Scene]) -> None:
     """Raise ValueError for paths that the fit itself sets, or that name two things."""
     for name in names:
         if name == "contact.width":
-            raise ValueError("free: 'contact.width' is no property of a body: give fit the widths to go through")
+            raise ValueError("free: 'contact.width' is not a property of a body: give `fit` the widths to go through")
         if any(
             name in channel_paths(s.channels) and paths.component(name)[0] in paths.catalogue(s.world) for s in scenes
         ):

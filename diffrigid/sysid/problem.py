@@ -25,7 +25,7 @@ from diffrigid.step import work
 from diffrigid.sysid.clocks import states_at
 from diffrigid.sysid.parameters import Scene, Slot, knows, put, reference, split
 from diffrigid.sysid.records import Run, series_of
-from diffrigid.sysid.sensors import Part, difference, is_angle
+from diffrigid.sysid.sensors import difference, is_angle, is_turn
 from diffrigid.sysid.times import controls_over, grid
 
 LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are returned
@@ -124,8 +124,7 @@ def _absent(slot: Slot) -> Slot:
 def known(run: Run, name: str) -> np.ndarray:
     """Whether residuals of a column are measured, (K, size of the residual) bool."""
     finite = np.isfinite(series_of(run, name).values)
-    observer = run.channels[name].observer
-    if not (isinstance(observer, Part) and observer.field == "q"):
+    if not is_turn(run.channels[name]):
         return finite
     return np.repeat(finite.all(1, keepdims=True), 1 if finite.shape[1] == 2 else 3, axis=1)
 

@@ -22,7 +22,7 @@ from diffrigid import joint_motion, so3
 from diffrigid.convert import nearest, numbers, unit_quaternion
 from diffrigid.numerics import norm
 from diffrigid.paths import component
-from diffrigid.pytree import Leaf, array, array_fields, map_arrays, pytree, replace, static
+from diffrigid.pytree import Leaf, array, map_arrays, pytree, replace, static
 from diffrigid.state import State, material_point, rotations
 from diffrigid.world import World, axis_sizes
 
@@ -187,7 +187,7 @@ def is_angle(channel: Channel) -> bool:
 
 def difference(channel: Channel, world: World, states: State, measured: Array) -> Array:
     """Predicted minus measured, (K, size of the residual, *batch); at most half a turn for angles and orientations."""
-    if _is_turn(channel):
+    if is_turn(channel):
         so, q = rotations(states.x.shape[2]), states.q[:, channel.observer.body]
         return jax.vmap(lambda measured, q: so.log(so.difference(measured, q)))(measured + jnp.zeros_like(q), q)
     away = predict(channel, world, states) - measured
@@ -197,7 +197,7 @@ def difference(channel: Channel, world: World, states: State, measured: Array) -
     return away
 
 
-def _is_turn(channel: Channel) -> bool:
+def is_turn(channel: Channel) -> bool:
     """Whether a column is a whole orientation, which has no bias or scale."""
     return isinstance(channel.observer, Part) and channel.observer.field == "q"
 
@@ -216,7 +216,7 @@ def channel_of(name: str, what: Any, world: World) -> Channel:
     except (TypeError, AttributeError, LookupError) as error:
         raise ValueError(f"observe[{name!r}] fails for a state of this world: {error}") from error
     channel = map_arrays(partial(_fill, sizes), replace(channel, observer=observer), name)
-    if _is_turn(channel) and not (np.all(channel.bias == 0) and np.all(channel.scale == 1)):
+    if is_turn(channel) and not (np.all(channel.bias == 0) and np.all(channel.scale == 1)):
         raise ValueError(f"observe[{name!r}] has a bias or a scale, expected none for an orientation: turn the shape")
     return channel
 
@@ -244,33 +244,10 @@ def size_of(observer: Any, world: World) -> int:
 def _resolved(name: str, what: Any, world: World) -> Any:
     """An observer with indices for the names of bodies."""
     if isinstance(what, str):
-        whole, index = component(what)
-        if index is not None and what != name:  # columns of that name are put together before
-            observer = _resolved(name, whole, world)
-            if index >= (size := size_of(observer, world)) or isinstance(observer, JointPart):
-                raise ValueError(f"observe[{name!r}] is {what!r}: {whole} has {size} numbers, from [0] on")
-            return Component(of=observer, index=index)
-        body, _, field = what.rpartition(".") if "." in what else (what, "", "x")
-        possible = [f"{b}.{f}" for b in world.names for f in FIELDS if f != "angle" or world.dim == 2]
-        of_joints = {
-            f"{j}.{f}": JointPart(joint=j, field=f)
-            for names, joint in zip(world.joint_names, world.joints, strict=True)
-            for j in names
-            for f in joint_motion.fields_of(joint)
-        }
-        if what in of_joints:
-            return of_joints[what]
-        possible += of_joints
-        if f"{body}.{field}" not in possible:
-            raise ValueError(
-                f"observations: no column {name!r} in this {world.dim}D world"
-                + ("" if name == what else f", which observes {what!r}")
-                + f": {nearest(what, possible)} Say what other columns observe by observe={{{name!r}: ...}}."
-            )
-        return Part(body=world.names.index(body), field=field)
-    if not callable(what) or not hasattr(what, "__dataclass_fields__"):
-        if not callable(what):
-            raise ValueError(f"observe[{name!r}] is {what!r}: expected 'ball.x', Marker(body='ball'), or a function")
+        return _by_name(name, what, world)
+    if not callable(what):
+        raise ValueError(f"observe[{name!r}] is {what!r}: expected 'ball.x', Marker(body='ball'), or a function")
+    if not hasattr(what, "__dataclass_fields__"):
         return Function(fn=what)
     changes: dict[str, Any] = {}
     target = getattr(what, "body", None)
@@ -283,48 +260,28 @@ def _resolved(name: str, what: Any, world: World) -> Any:
     return replace(what, **changes)
 
 
-# ---- paths of columns
-
-
-def read_channel(channels: dict[str, Channel], path: str) -> Array:
-    """Value of COLUMN.field, or of "clock", which all columns share."""
-    node: Any = channels
-    for key in _chain(channels, path)[0]:
-        node = node[key] if isinstance(node, dict) else getattr(node, key)
-    return jnp.asarray(node)
-
-
-def write_channel(channels: dict[str, Channel], path: str, value: Array) -> dict[str, Channel]:
-    """The channels with one number or vector changed."""
-    for chain in _chain(channels, path):
-        channels = _updated(channels, chain, value)
-    return channels
-
-
-def channel_paths(channels: dict[str, Channel]) -> dict[str, list[tuple[str, ...]]]:
-    """Every path of the columns, and the chains of attributes that it stands for."""
-    out: dict[str, list[tuple[str, ...]]] = {"clock": [(name, "clock") for name in channels]}
-    for name, channel in channels.items():
-        fields = ("clock",) if _is_turn(channel) else ("bias", "scale", "clock")
-        out |= {f"{name}.{field}": [(name, field)] for field in fields}
-        out |= {f"{name}.{'.'.join(chain)}": [(name, "observer", *chain)] for chain in _leaves(channel.observer)}
-    return out
-
-
-def _leaves(observer: Any) -> list[tuple[str, ...]]:
-    chains: list[tuple[str, ...]] = [(field,) for field in array_fields(observer)]
-    for key in ("of", "a", "b"):
-        if hasattr(observer, key):
-            chains += [(key, *chain) for chain in _leaves(getattr(observer, key))]
-    return chains
-
-
-def _chain(channels: dict[str, Channel], path: str) -> list[tuple[str, ...]]:
-    return channel_paths(channels)[path]
-
-
-def _updated(node: Any, chain: tuple[str, ...], value: Array) -> Any:
-    key, rest = chain[0], chain[1:]
-    child = node[key] if isinstance(node, dict) else getattr(node, key)
-    child = _updated(child, rest, value) if rest else jnp.reshape(value, jnp.shape(child))
-    return {**node, key: child} if isinstance(node, dict) else replace(node, **{key: child})
+def _by_name(name: str, what: str, world: World) -> Any:
+    """The observer of a body's or a joint's field, or of one number of it; a body alone stands for its position."""
+    whole, index = component(what)
+    if index is not None and what != name:  # columns of that name are put together before
+        observer = _by_name(name, whole, world)
+        if index >= (size := size_of(observer, world)) or isinstance(observer, JointPart):
+            raise ValueError(f"observe[{name!r}] is {what!r}: {whole} has {size} numbers, from [0] on")
+        return Component(of=observer, index=index)
+    possible: dict[str, Part | JointPart] = {
+        f"{body}.{field}": Part(body=k, field=field)
+        for k, body in enumerate(world.names)
+        for field in FIELDS
+        if field != "angle" or world.dim == 2
+    }
+    for joints, joint in zip(world.joint_names, world.joints, strict=True):
+        for field in joint_motion.fields_of(joint):
+            possible |= {f"{j}.{field}": JointPart(joint=j, field=field) for j in joints}
+    wanted = what if "." in what else f"{what}.x"
+    if wanted not in possible:
+        raise ValueError(
+            f"observations: no column {name!r} in this {world.dim}D world"
+            + ("" if name == what else f", which observes {what!r}")
+            + f": {nearest(what, possible)} Say what other columns observe by observe={{{name!r}: ...}}."
+        )
+    return possible[wanted]
