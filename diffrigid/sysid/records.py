@@ -85,38 +85,42 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
     records = [r if isinstance(r, Record) else Record(r) for r in (observations if several else [observations])]
     if not records:
         raise ValueError("observations is an empty list: expected at least one record")
-    found = []
-    for index, record in enumerate(records):
-        where = f"observations[{index}]" if several else "observations"
-        own_world = world if record.world is None else record.world
-        own_state = state if record.state is None else record.state
-        check_mapping(f"{where}.noise", record.noise)
-        check(own_world, own_state)
-        series, channels, controls = columns(own_world, record.observations, observe, where)
-        names = [s.name for s in series]
-        if unknown := set(record.noise or {}) - set(names):
-            raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
-        given = {name: sigma for name, sigma in (noise or {}).items() if name in names} | dict(record.noise or {})
-        first = min(float(s.t[0]) for s in series)
-        start = first if record.start is None else float(known_number(f"{where}.start", record.start))
-        if start > first:
-            raise ValueError(
-                f"{where}: start is {start:g} s, after the first measured time {first:g} s: make it earlier"
-            )
-        if missing := controlled(own_world.forces).keys() - {control.name for control in controls}:
-            raise ValueError(f"{where} has no column {min(missing)!r}, which a force takes as its control")
-        for control in controls:
-            if control.t[0] > start + SAME:
-                raise ValueError(
-                    f"{where}[{control.name!r}] begins at {control.t[0]:g} s, after the start {start:g} s: what acts "
-                    "before?"
-                )
-        found.append(Run(own_world, own_state, channels, series, start, given, controls))
+    found = [
+        _run(world, state, record, observe, noise or {}, f"observations[{index}]" if several else "observations")
+        for index, record in enumerate(records)
+    ]
     everywhere = sorted({s.name for run in found for s in run.series})
     if unknown := set(noise or {}) - set(everywhere):
         raise ValueError(f"noise: no column {sorted(unknown)[0]!r} in observations, there are {everywhere}")
     _refuse_empty_columns(found)
     return found
+
+
+def _run(world: World, state: State, record: Record, observe: Mapping, noise: Mapping, where: str) -> Run:
+    """Read and check one record, which takes from `world`, `state` and `noise` what it does not give."""
+    world = world if record.world is None else record.world
+    state = state if record.state is None else record.state
+    check_mapping(f"{where}.noise", record.noise)
+    check(world, state)
+    series, channels, controls = columns(world, record.observations, observe, where)
+    names = [s.name for s in series]
+    own = dict(record.noise or {})
+    if unknown := set(own) - set(names):
+        raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
+    first = min(float(s.t[0]) for s in series)
+    start = first if record.start is None else float(known_number(f"{where}.start", record.start))
+    if start > first:
+        raise ValueError(f"{where}: start is {start:g} s, after the first measured time {first:g} s: make it earlier")
+    if missing := controlled(world.forces).keys() - {control.name for control in controls}:
+        raise ValueError(f"{where} has no column {min(missing)!r}, which a force takes as its control")
+    for control in controls:
+        if control.t[0] > start + SAME:
+            raise ValueError(
+                f"{where}[{control.name!r}] begins at {control.t[0]:g} s, after the start {start:g} s: what acts "
+                "before?"
+            )
+    given = {name: sigma for name, sigma in noise.items() if name in names} | own
+    return Run(world, state, channels, series, start, given, controls)
 
 
 def same_data(one: Run, other: Run) -> bool:
@@ -281,14 +285,12 @@ def _filled(values: Any, rows: int, size: int, where: str, world: World) -> np.n
 
 
 def _refuse_empty_columns(found: list[Run]) -> None:
-    known: dict[str, bool] = {}
-    for run in found:
-        for s in run.series:
-            known[s.name] = known.get(s.name, False) or bool(np.isfinite(s.values).any())
-    if empty := [name for name, any_number in known.items() if not any_number]:
+    series = [s for run in found for s in run.series]
+    measured = {s.name for s in series if np.isfinite(s.values).any()}
+    if empty := [s.name for s in series if s.name not in measured]:
         raise ValueError(
             f"observations[{empty[0]!r}]: nothing is measured, every value is NaN: leave the column out, or look where "
-            "the NaN were made"
+            "the NaN come from"
         )
 
 
