@@ -86,7 +86,7 @@ CSV = "t,ball.x[0],ball.x[1]\n0,1,0\n0.1,1.5,\n0.2,2,-1\n"
 FILES = {
     "scene": (read_scene, invalid.SCENE),
     "fit": (dr.load_fit, json.dumps(invalid.SAVED)),
-    "csv": (dr.sysid.records.read_csv, CSV),
+    "csv": (dr.sysid.columns.read_csv, CSV),
     "mjcf": (dr.load_mjcf, models.TREE),
     "mjcf of links": (dr.load_mjcf, models.LINKS),
     "urdf": (dr.load_urdf, models.ROBOT),

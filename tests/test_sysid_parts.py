@@ -17,13 +17,13 @@ from diffrigid.__main__ import main
 from diffrigid.impacts import order_of_impacts
 from diffrigid.scene_file import read_scene
 from diffrigid.step import steps_in
+from diffrigid.sysid.columns import columns, read_csv
 from diffrigid.sysid.diagnosis import Blind, coordinates, doubts, normality, whiteness
 from diffrigid.sysid.intervals import interval_of, unseen_of
 from diffrigid.sysid.levenberg import Numbers, Point, minimise
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import in_words
 from diffrigid.sysid.parameters import Slot
-from diffrigid.sysid.records import columns, read_csv
 from diffrigid.sysid.sampling import Posterior
 from diffrigid.sysid.sensors import channel_of, difference, predict
 from diffrigid.sysid.summary import Parameter, Summary

@@ -7,8 +7,8 @@ from typing import Any
 
 from diffrigid import scene_file
 from diffrigid.convert import nearest
+from diffrigid.sysid.columns import read_csv
 from diffrigid.sysid.fit import fit
-from diffrigid.sysid.records import read_csv
 from diffrigid.sysid.summary import load_fit
 
 

@@ -11,6 +11,7 @@ from diffrigid.convert import numbers
 from diffrigid.state import State
 from diffrigid.step import at_least_one
 from diffrigid.sysid.charts import Chart
+from diffrigid.sysid.columns import check_mapping
 from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
 from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.intervals import describe
@@ -19,7 +20,6 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import pieces
 from diffrigid.sysid.points import by_column, linear_of, row_mask
-from diffrigid.sysid.records import check_mapping
 from diffrigid.sysid.remarks import remarks_on
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import (

@@ -1,22 +1,19 @@
-"""Measured records: columns by name from a dictionary, a table or a CSV file, checked."""
+"""Measured records: columns with the scene, the start and the noise that belong to them, checked."""
 
-import csv
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from diffrigid.controls import controlled
 from diffrigid.convert import known_number
-from diffrigid.paths import component
 from diffrigid.state import State
-from diffrigid.sysid.sensors import Channel, Part, channel_of
+from diffrigid.sysid.columns import Series, check_mapping, columns
+from diffrigid.sysid.sensors import Channel
 from diffrigid.world import World, check
 
 SAME = 1e-9  # [s] times of different columns that are this close are the same
-UNLIKE = 20.0  # [-] speeds that differ by more than this factor from those of the positions have another unit
 
 
 @dataclass(frozen=True)
@@ -41,15 +38,6 @@ class Record:
     world: World | None = None
     start: float | None = None
     noise: Mapping[str, Any] | None = None
-
-
-@dataclass(frozen=True)
-class Series:
-    """One measured column, or a control."""
-
-    name: str
-    t: np.ndarray  # (K,) [s], increasing
-    values: np.ndarray  # (K, size), NaN where missing
 
 
 @dataclass(frozen=True)
@@ -132,158 +120,6 @@ def same_data(one: Run, other: Run) -> bool:
     )
 
 
-def columns(
-    world: World, observations: Any, observe: Mapping[str, Any], where: str = "observations"
-) -> tuple[tuple[Series, ...], dict[str, Channel], tuple[Series, ...]]:
-    """Columns of a record, what each observes, and the controls among them, which have the names given by forces.
-
-    Args:
-        observations: a mapping or a table (anything with `columns`), or the path of a CSV file. "t" (K,) [s], and by
-            name (K,) or (K, size), NaN where missing; or a pair (t, values) for a column with times of its own. A
-            component stands alone as "ball.x[0]".
-        observe: what a column observes if it is not named for that.
-    """
-    table = _table(observations, where)
-    check_mapping("observe", observe)
-    if odd := [name for name in table if not isinstance(name, str)]:
-        raise ValueError(f"{where} has a column {odd[0]!r}: expected names of columns, such as 'ball.x'")
-    shared = None if "t" not in table else _times(table.pop("t"), f'{where}["t"]')
-    gathered = _gather(table)
-    if shared is None and not any(isinstance(values, tuple) for values in gathered.values()):
-        raise ValueError(f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours')
-    found, channels, controls, sizes = [], {}, [], controlled(world.forces)
-    for name, values in gathered.items():
-        if isinstance(values, tuple) and len(values) == 2:
-            t, values = _times(values[0], f"{where}[{name!r}]"), values[1]
-        elif shared is not None:
-            t = shared
-        else:
-            raise ValueError(f'{where}: expected a column "t" of times [s], got {sorted(gathered)}')
-        if name in sizes:
-            controls.append(Series(name, t, _filled(values, len(t), sizes[name], f"{where}[{name!r}]", world)))
-            if not np.isfinite(controls[-1].values).all():
-                raise ValueError(f"{where}[{name!r}] has NaN: expected numbers, for a control acts all the time")
-            continue
-        channel = channel_of(name, observe.get(name, name), world)
-        values = _filled(values, len(t), channel.bias.shape[0], f"{where}[{name!r}]", world)
-        found.append(Series(name, t, values))
-        channels[name] = channel
-    if unused := set(observe) - set(gathered):
-        raise ValueError(f"observe: no column {sorted(unused)[0]!r} in {where}, there are {sorted(gathered)}")
-    if not found:
-        raise ValueError(f"{where}: nothing is measured, there is no column beside the times")
-    _refuse_units(found, channels, where)
-    return tuple(found), channels, tuple(controls)
-
-
-def read_csv(path: str | Path) -> dict[str, np.ndarray]:
-    """Read the columns of a file with one line of names; an empty cell is a missing value.
-
-    Between columns are commas, or semicolons or tabs where the names have these; numbers may then have decimal commas.
-    """
-    try:
-        with open(Path(path), newline="", encoding="utf-8-sig") as file:  # a number would be an open file
-            lines = [line for line in file if line.strip() and not line.startswith("#")]
-        mark = next((mark for mark in ";\t" if lines and mark in lines[0]), ",")
-        rows = list(csv.reader(lines, delimiter=mark))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is no CSV file: {error}") from None
-    if not rows:
-        raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
-    names, body = [name.strip() for name in rows[0]], rows[1:]
-    for number, row in enumerate(body, start=2):
-        if len(row) != len(names):
-            raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)} like the names")
-    try:
-        if mark != ",":
-            body = [[cell.replace(",", ".") for cell in row] for row in body]
-        cells = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in body])
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}; expected numbers under one line of names, empty where missing") from None
-    return {name: cells[:, k] for k, name in enumerate(names)} if len(body) else {name: np.zeros(0) for name in names}
-
-
-def _table(observations: Any, where: str) -> dict[str, Any]:
-    if isinstance(observations, str | Path):
-        return dict(read_csv(observations))
-    if hasattr(observations, "columns"):
-        return {str(name): np.asarray(observations[name]) for name in observations.columns}
-    if not isinstance(observations, Mapping):
-        raise ValueError(
-            f"{where} is a {type(observations).__name__}: expected a dict, a table or the path of a CSV file"
-        )
-    return dict(observations)
-
-
-def _times(t: Any, where: str) -> np.ndarray:
-    t = _floats(t, where)
-    if t.ndim != 1 or len(t) < 2:
-        raise ValueError(f"{where} has shape {t.shape}: expected at least two increasing times")
-    if len(bad := np.flatnonzero(~(np.diff(t) > 0))):
-        k = int(bad[0])
-        raise ValueError(
-            f"{where}: expected increasing times without NaN, got {t[k]:g}, then {t[k + 1]:g} in row {k + 1}"
-        )
-    return t
-
-
-def _floats(values: Any, where: str) -> np.ndarray:
-    """Convert a column to floats; masked values of a table are missing."""
-    try:
-        array: np.ndarray = np.asarray(np.ma.filled(np.ma.asarray(values, float), np.nan))
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{where} is {values!r:.80}: expected numbers, NaN where missing") from None
-    if np.isinf(array).any():
-        raise ValueError(f"{where} has infinite values: expected numbers, NaN where missing")
-    return array
-
-
-def check_mapping(where: str, value: Any) -> None:
-    """Raise ValueError unless a value is a dict by column, or None."""
-    if value is not None and not isinstance(value, Mapping):
-        raise ValueError(f"{where} is {value!r:.80}: expected a dict by name of column")
-
-
-def _gather(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect components "ball.x[0]", "ball.x[1]" under "ball.x", as {component: values}."""
-    out: dict[str, Any] = {}
-    for name, values in table.items():
-        if isinstance(values, Mapping):
-            raise ValueError(f"observations[{name!r}] is a dict: expected an array, or a pair (t, values)")
-        whole, index = component(name)
-        if index is not None:
-            parts = out.setdefault(whole, {})
-            if not isinstance(parts, dict):
-                raise ValueError(f"observations: both {whole!r} and {name!r} are given: leave one out")
-            parts[index] = values
-        elif name in out:
-            raise ValueError(f"observations: both {name!r} and a component of it are given: leave one out")
-        else:
-            out[name] = values
-    return out
-
-
-def _filled(values: Any, rows: int, size: int, where: str, world: World) -> np.ndarray:
-    """Fill a column (K, size) from an array or from some of its components."""
-    if isinstance(values, dict):
-        if bad := [index for index in values if index >= size]:
-            raise ValueError(f"{where}: component [{bad[0]}] of {size} in this {world.dim}D world")
-        whole = np.full((rows, size), np.nan)
-        for index, part in values.items():
-            part = _floats(part, f"{where}[{index}]")
-            if part.shape != (rows,):
-                raise ValueError(f"{where}[{index}] has shape {part.shape}, expected ({rows},) like t")
-            whole[:, index] = part
-        return whole
-    values = _floats(values, where)
-    values = values[:, None] if values.ndim == 1 else values
-    if values.shape != (rows, size):
-        raise ValueError(
-            f"{where} has shape {values.shape}, expected ({rows}, {size}) like t in this {world.dim}D world"
-        )
-    return values
-
-
 def _refuse_empty_columns(found: list[Run]) -> None:
     series = [s for run in found for s in run.series]
     measured = {s.name for s in series if np.isfinite(s.values).any()}
@@ -292,34 +128,6 @@ def _refuse_empty_columns(found: list[Run]) -> None:
             f"observations[{empty[0]!r}]: nothing is measured, every value is NaN: leave the column out, or look where "
             "the NaN come from"
         )
-
-
-def _refuse_units(found: list[Series], channels: Mapping[str, Channel], where: str) -> None:
-    """Raise ValueError for velocities far from the slopes of the body's positions: they have another unit."""
-    parts = {(c.observer.body, c.observer.field): name for name, c in channels.items() if isinstance(c.observer, Part)}
-    by_name = {s.name: s for s in found}
-    for (body, field), name in parts.items():
-        if field == "v" and (body, "x") in parts:
-            x, v = by_name[parts[body, "x"]], by_name[name]
-            # Noise makes the positions of neighbours differ, but less so over a tenth of the record.
-            near, far = (_median_size(_slopes(x, lag)) for lag in (1, max(len(x.t) // 10, 1)))
-            speeds = _median_size(v.values)
-            if near > 0 and speeds > 0 and (speeds > UNLIKE * near or UNLIKE * speeds < min(near, far)):
-                raise ValueError(
-                    f"{where}[{name!r}]: speeds of about {speeds:.3g}, but {parts[body, 'x']!r} moves at {far:.3g} a "
-                    "second: are both in metres and seconds?"
-                )
-
-
-def _slopes(series: Series, lag: int) -> np.ndarray:
-    """Difference quotients of values that are `lag` rows apart, (K - lag, size)."""
-    return (series.values[lag:] - series.values[:-lag]) / (series.t[lag:] - series.t[:-lag])[:, None]
-
-
-def _median_size(vectors: np.ndarray) -> float:
-    """Median length of the vectors (K, D) that are complete; 0 if none is."""
-    complete = vectors[np.isfinite(vectors).all(1)]
-    return float(np.median(np.sqrt((complete**2).sum(1)))) if len(complete) else 0.0
 
 
 def noise_guess(values: np.ndarray, turn: float) -> float:

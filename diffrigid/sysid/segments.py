@@ -25,9 +25,10 @@ from diffrigid import paths
 from diffrigid.state import State, rotations
 from diffrigid.step import at_least_one
 from diffrigid.sysid.charts import rotation
+from diffrigid.sysid.columns import Series, columns
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import Each, each, real
-from diffrigid.sysid.records import Record, Series, columns
+from diffrigid.sysid.records import SAME, Record
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.times import motion
@@ -53,8 +54,8 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
     edges = np.linspace(first, last, count + 1)
     out = []
     for k, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-        start = max(s.t[s.t <= start + 1e-9][-1] for s in series if (s.t <= start + 1e-9).any())
-        use = {s.name: (s.t >= start - 1e-9) & (s.t <= end + 1e-9) for s in series}
+        start = max(s.t[s.t <= start + SAME][-1] for s in series if (s.t <= start + SAME).any())
+        use = {s.name: (s.t >= start - SAME) & (s.t <= end + SAME) for s in series}
         pieces = {s.name: (s.t[use[s.name]], s.values[use[s.name]]) for s in series}
         pieces |= {c.name: (c.t, c.values) for c in controls}
         own = state
@@ -71,7 +72,7 @@ def _guessed(world: World, state: State, series: Series, start: float) -> State:
     names = {"x": ("x", "v"), "angle": ("angle", "w")}
     if field not in names:
         return state
-    later = (series.t >= start - 1e-9) & np.isfinite(series.values).all(1)
+    later = (series.t >= start - SAME) & np.isfinite(series.values).all(1)
     t, values = series.t[later][:FRAMES] - start, series.values[later][:FRAMES]
     if len(t) < 2:
         return state

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffrigid.impacts import contacts
+from diffrigid.sysid.columns import Series
 from diffrigid.sysid.intervals import number_names
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import Profile, profile, with_profiles
-from diffrigid.sysid.records import Series
 from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.table import HEADER, SHOWN, below, rows
 from diffrigid.trajectory import Trajectory

@@ -17,7 +17,7 @@ from diffrigid.joints import Distance
 from diffrigid.pytree import align
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Profile, Shape, Sphere, with_topology
 from diffrigid.state import State, kinetic_energy
-from diffrigid.sysid.records import columns
+from diffrigid.sysid.columns import columns
 from diffrigid.sysid.sensors import Part
 from diffrigid.touch import rotated
 from diffrigid.trajectory import Trajectory
