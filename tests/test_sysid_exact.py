@@ -16,7 +16,7 @@ from scipy.special import stdtrit
 import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.sysid.covariance import own_covariance
-from diffrigid.sysid.profile import Profile
+from diffrigid.sysid.profile import ProfileLikelihood
 
 NOISE, RECORDS = 0.01, 6  # [m]
 FREE = {"gravity": dr.real(), "p.x": dr.each(dr.real()), "p.v": dr.each(dr.real())}
@@ -401,7 +401,7 @@ def test_figures_show_residuals_costs_correlations_and_profiles(fit):
     assert_allclose(np.stack(drawn, axis=1), fit.residuals[2]["p.x"][: len(drawn[0])])
     assert sysid.cost_figure(fit).axes[0].lines[0].get_ydata() == fit.costs
     assert_allclose(sysid.correlation_figure(fit).axes[0].images[0].get_array(), fit.correlation)
-    found = Profile("k", np.arange(3.0), np.array([1.0, 0.0, 1.0]), 0.5, 0.3, 1.7)
+    found = ProfileLikelihood("k", np.arange(3.0), np.array([1.0, 0.0, 1.0]), 0.5, 0.3, 1.7)
     assert_allclose(sysid.profile_figure(found).axes[0].lines[0].get_ydata(), found.rise)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.intervals import number_names
 from diffrigid.sysid.orders import alike
-from diffrigid.sysid.profile import Profile
+from diffrigid.sysid.profile import ProfileLikelihood
 from diffrigid.sysid.result import Fit
 
 
@@ -58,7 +58,7 @@ def correlation_figure(fit: Fit) -> Any:
     return figure
 
 
-def profile_figure(found: Profile) -> Any:
+def profile_figure(found: ProfileLikelihood) -> Any:
     """Rise of the cost about the best value, and the level of the 95 % interval."""
     figure, axes = _axes()
     axes.plot(found.values, found.rise, "o-")

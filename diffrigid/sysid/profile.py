@@ -22,8 +22,8 @@ FAR = 15.0  # z at which a bounded number is at its bound to single precision
 
 
 @dataclass(frozen=True)
-class Profile:
-    """Profile of one number: values, and the rise of the cost when all other numbers are fitted to each."""
+class ProfileLikelihood:
+    """Values of one number, and the rise of the cost at each, all other numbers fitted to it."""
 
     name: str
     values: np.ndarray  # (P,) increasing
@@ -45,7 +45,7 @@ class Profile:
         return "\n".join([interval, head, *rows])
 
 
-def profile(fit: Fit, name: str, points: int = 9) -> Profile:
+def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
     """Profile of a shared number, its interval being where the cost rises by less than t^2 / 2.
 
     Unlike an interval from the Jacobian it knows of curvature: it may be lopsided, or open: where the rise does not
@@ -73,10 +73,10 @@ def profile(fit: Fit, name: str, points: int = 9) -> Profile:
     low, high = (float(kind.value(np.array([fit.shared[index] + end]))[0]) for end in ends)
     opened = tuple(word for word, end in zip(("below", "above"), ends, strict=True) if np.isnan(end))
     low, high = kind.low if np.isnan(low) else low, kind.high if np.isnan(high) else high
-    return Profile(name, kind.value(z), rise, level, low, high, opened)
+    return ProfileLikelihood(name, kind.value(z), rise, level, low, high, opened)
 
 
-def with_profiles(fit: Fit, profiles: Sequence[Profile]) -> Fit:
+def with_profiles(fit: Fit, profiles: Sequence[ProfileLikelihood]) -> Fit:
     """The fit with the intervals of profiles in its table, and a note on those that are open."""
     found = {p.name: p for p in profiles}
 

@@ -10,7 +10,7 @@ from diffrigid.impacts import contacts
 from diffrigid.sysid.columns import Series
 from diffrigid.sysid.intervals import number_names
 from diffrigid.sysid.orders import alike
-from diffrigid.sysid.profile import Profile, profile, with_profiles
+from diffrigid.sysid.profile import ProfileLikelihood, profile, with_profiles
 from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.table import HEADER, SHOWN, below, rows
 from diffrigid.trajectory import Trajectory
@@ -128,7 +128,7 @@ def _by_record(fit: "Fit") -> str:
     return chart("Root mean square of each record", "record", "[standard deviations]", [curve], margin=0.02)
 
 
-def _search(fit: "Fit", found: Sequence[Profile]) -> Section:
+def _search(fit: "Fit", found: Sequence[ProfileLikelihood]) -> Section:
     names = number_names(fit.problem)
     charts = [_costs(fit)] if len(fit.costs) > 1 else []
     if len(names) > 1:
@@ -148,7 +148,7 @@ def _costs(fit: "Fit") -> str:
     return chart("Cost of each start", "start", "log10 of cost / lowest", curves, margin=0.02)
 
 
-def profile_chart(found: Profile) -> str:
+def profile_chart(found: ProfileLikelihood) -> str:
     """Chart of the rise of the cost when one number is held; dashed: the ends of its interval."""
     near = found.rise < NEAR * found.level
     values, rise = found.values[near], found.rise[near]
