@@ -95,7 +95,7 @@ def least_squares(residuals, z, iterations):
     z = jnp.asarray(z)
     numbers = Numbers(jnp.zeros((0, z.shape[1]), z.dtype), z[:, None])
     reach = Numbers(numbers.shared[:, :1], jnp.full((len(z), 1, 1), jnp.inf, z.dtype))
-    point, _ = minimise(at, ((0,),), numbers, Squares(), iterations, reach, lambda count, costs: None)
+    point, _ = minimise(at, ((0,),), numbers, Squares(), iterations, reach)
     return point.z.own[:, 0], cost_of(Squares(), point.residuals)
 
 

@@ -15,7 +15,7 @@ from diffrigid.sysid.columns import check_mapping
 from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
 from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.intervals import describe
-from diffrigid.sysid.levenberg import INTERRUPTED, Point, cost_of, levenberg
+from diffrigid.sysid.levenberg import INTERRUPTED, Point, Report, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import pieces
@@ -112,17 +112,14 @@ def fit(
     solve = levenberg if solver is None else solver
     z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)
-    estimate, early = bool(problem.noise), ""
+    # The last one twice if noise is estimated: with the guess, then with the estimate from the residuals.
+    again = stages[-1:] if problem.noise else []
     point: Any = None
-    for number, (width, window) in enumerate(stages):
-        # Twice if noise is estimated: with the guess, then with the estimate from the residuals.
-        for again in range(2 if estimate and number == len(stages) - 1 else 1):
-            noise_now = estimated_noise(problem, point, loss) if again else problem.noise
-            problem = with_noise(problem, noise_now, window, width)
-            point, early = solve(problem.groups, z, loss, iterations, reach, report)
-            z = point.z
-            if early == INTERRUPTED:
-                break
+    for number, (width, window) in enumerate([*stages, *again]):
+        noise_now = problem.noise if number < len(stages) else estimated_noise(problem, point, loss)
+        problem = with_noise(problem, noise_now, window, width)
+        point, early = solve(problem.groups, z, loss, iterations, reach, report)
+        z = point.z
         if early == INTERRUPTED:
             break
     report(-1, np.asarray(cost_of(loss, point.residuals)))
@@ -271,7 +268,7 @@ def _refuse_blind(problem: Problem, linear: Linear) -> None:
             )
 
 
-def _printer(progress: bool | None, starts: int) -> Callable[[int, np.ndarray], None]:
+def _printer(progress: bool | None, starts: int) -> Report:
     """Make a function that prints the iteration and the best cost, over one line."""
     if progress is None:
         progress = sys.stdout.isatty() or "ipykernel" in sys.modules

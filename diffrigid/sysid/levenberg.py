@@ -30,6 +30,8 @@ ITERATIONS = 60  # at most, unless another number is asked for
 INTERRUPTED = "interrupted: the best so far"
 UNFINISHED = "not converged after {} iterations: raise iterations, or start elsewhere"
 
+Report = Callable[[int, np.ndarray], None]  # called with the number of the iteration, and the cost of every start
+
 
 class Numbers(NamedTuple):
     """Unbounded numbers z of S starts."""
@@ -203,9 +205,12 @@ def _in_order(members: tuple[tuple[int, ...], ...], parts: Sequence[Array]) -> A
     return joined if np.array_equal(order, np.arange(len(order))) else joined[order]
 
 
+def silent(count: int, costs: np.ndarray) -> None:
+    """Report nothing."""
+
+
 def levenberg(
-    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int | None, reach: Numbers,
-    report: Callable[[int, np.ndarray], None],
+    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int | None, reach: Numbers, report: Report = silent
 ) -> tuple[Point, str]:  # fmt: skip
     """Minimise from the starts z: the lowest points, and "", or why it ended before the best of them converged.
 
@@ -213,7 +218,7 @@ def levenberg(
     to gain.
 
     Args:
-        reach: longest step of each number, (a, 1) and (b, 1, 1); a shared number for which it is 0 is held.
+        reach: longest step of each number, (a, 1) and (b, 1, 1); a shared number with a reach of 0 is held.
     """
     members = tuple(group.members for group in groups)
     return minimise(partial(point_at, groups), members, z, loss, iterations, reach, report)
@@ -221,7 +226,7 @@ def levenberg(
 
 def minimise(
     at: Callable[[Numbers], Point], members: tuple[tuple[int, ...], ...], z: Numbers, loss: Any,
-    iterations: int | None, reach: Numbers, report: Callable[[int, np.ndarray], None],
+    iterations: int | None, reach: Numbers, report: Report = silent,
 ) -> tuple[Point, str]:  # fmt: skip
     """`levenberg` for any residuals: `at` gives them and their Jacobians, for groups of the records `members`."""
     trial, iterations = at(z), ITERATIONS if iterations is None else iterations

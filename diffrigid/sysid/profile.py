@@ -142,7 +142,7 @@ def _costs(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
         shared[index] = held
         own = np.repeat(fit.own[..., None], count, axis=-1)
         start = Numbers(*(jnp.asarray(part, fit.problem.dtype) for part in (shared, own)))
-        point, _ = levenberg(fit.problem.groups, start, fit.loss, 30, reach, lambda count, costs: None)
+        point, _ = levenberg(fit.problem.groups, start, fit.loss, 30, reach)
         out.append(np.asarray(cost_of(fit.loss, point.residuals), float))
     return np.concatenate(out)[: len(z)]
 

@@ -142,7 +142,7 @@ class Fit:
         z, reach = make_starts(problem, starts, seed), reach_of(problem, range(problem.sizes[0]))
         z = z._replace(shared=jnp.repeat(z.shared[:, :1], starts, axis=1))
         iterations = SCORED if problem.own else 0
-        point, _ = levenberg(problem.groups, z, self.loss, iterations, reach, lambda count, costs: None)
+        point, _ = levenberg(problem.groups, z, self.loss, iterations, reach)
         best = best_by_record(problem.groups, point, self.loss)
         found = [by_column(problem, point, start, in_units=True)[k] for k, start in enumerate(best)]
         names = dict.fromkeys(name for columns in found for name in columns)
