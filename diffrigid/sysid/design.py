@@ -1,7 +1,8 @@
 """Design of experiments: the intervals that a planned record would give, and the launch that gives the narrowest."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,18 +10,19 @@ import numpy as np
 
 from diffrigid.state import State
 from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
-from diffrigid.sysid.diagnosis import Blind, blind_directions, coordinates, infinite_where_blind
+from diffrigid.sysid.diagnosis import Coordinate, blind_directions, infinite_where_blind
 from diffrigid.sysid.intervals import coordinates_of, interval_of, unit_of, unseen_of
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.parameters import make_slots, pieces, put, reference
+from diffrigid.sysid.parameters import Scene, make_slots, pieces, put, reference
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.records import Record
-from diffrigid.sysid.setup import Problem, first_numbers, make_problem, make_starts, scene_of
+from diffrigid.sysid.setup import Problem, first_numbers, first_value, make_problem, make_starts, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.world import World
 
 NUDGE = 1e-3  # change of z for differences
+QUANTILE = 1.959964  # 97.5 % of the normal distribution are below
 SHRINK, GROW = 0.5, 1.5  # factor on the length of a step that loses, or gains
 
 
@@ -53,7 +55,13 @@ def expected_intervals(
         0.039
     """
     problem = _problem(world, state, [state], planned, free, noise, observe, dt)
-    return _parameters(problem, 0, _linears(problem)[0])
+    linear, (z, _), out = _linear(problem), first_numbers(problem), []
+    covariance, blind = from_jacobian(linear).covariance, blind_directions(linear, coordinates_of(problem))
+    for slot, rows in pieces(problem.shared):
+        about, unseen = first_value(problem, slot), unseen_of(blind, rows)
+        ends = interval_of(slot, z[rows], covariance[rows, rows], about, QUANTILE, unseen)
+        out.append(Parameter(slot.name, *ends, unit_of(problem, slot), "expected"))
+    return tuple(out)
 
 
 def blind_spots(
@@ -70,8 +78,7 @@ def blind_spots(
         ('only the ratio ball.mass / spring.stiffness is seen',)
     """
     problem = make_problem(world, state, observations, free=free, noise=noise, observe=observe, dt=dt)
-    linear = linear_of(problem, point_at(problem.groups, make_starts(problem, 1, 0)), 0, Squares(), False)
-    return tuple(blind.words for blind in blind_directions(linear, coordinates_of(problem)))
+    return tuple(blind.words for blind in blind_directions(_linear(problem), coordinates_of(problem)))
 
 
 def best_launch(
@@ -86,29 +93,36 @@ def best_launch(
 
     The gradient of the information is by central differences of exact Jacobians, all launches in one batch.
     """
-    slots, _ = make_slots(vary, [scene_of(_problem(world, state, [state], planned, free, noise, observe, dt).runs[0])])
-    count = sum(slot.size for slot in slots)
-    lanes = starts * (2 * count + 1)
-    problem = _problem(world, state, [state] * lanes, planned, free, noise, observe, dt)
-    random, scene = np.random.default_rng(seed), scene_of(problem.runs[0])
+    plan = partial(_problem, world, state, planned=planned, free=free, noise=noise, observe=observe, dt=dt)
+    scene = scene_of(plan([state]).runs[0])
+    slots, _ = make_slots(vary, [scene])
+    about = [np.asarray(reference(slot, scene)) for slot in slots]
+    count, random = sum(slot.size for slot in slots), np.random.default_rng(seed)
 
-    def first(k: int) -> np.ndarray:
-        about = [np.asarray(reference(slot, scene)) for slot in slots]
-        pairs = zip(slots, about, strict=True)
-        return np.concatenate([s.kind.draw(a, random) if k else s.kind.unbounded(a) for s, a in pairs])
+    def launched(u: np.ndarray) -> Scene:
+        return put(slots, scene, jnp.asarray(u, scene.state.x.dtype))
 
     def scores(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Scores of launches u (starts, count), and their gradients."""
         shifts = np.concatenate([np.zeros((1, count)), NUDGE * np.eye(count), -NUDGE * np.eye(count)])
-        points = (u[:, None] + shifts[None]).reshape(lanes, count)
-        states = [put(slots, scene, jnp.asarray(p, scene.state.x.dtype)).state for p in points]
-        found = _problem(world, state, states, planned, free, noise, observe, dt)
-        each = [_score(_covariance(found, k, linear)) for k, linear in enumerate(_linears(found))]
-        value = np.array(each).reshape(starts, -1)
+        points = (u[:, None] + shifts[None]).reshape(-1, count)
+        problem = plan([launched(point).state for point in points])
+        places = coordinates_of(problem)
+        value = np.array([_score(linear, places) for linear in _linears(problem)]).reshape(starts, -1)
         return value[:, 0], (value[:, 1 : count + 1] - value[:, count + 1 :]) / (2 * NUDGE)
 
-    u = np.stack([first(k) for k in range(starts)])
-    length = np.full(starts, 0.3)
+    drawn = [[slot.kind.draw(a, random) for slot, a in zip(slots, about, strict=True)] for _ in range(starts - 1)]
+    first = [slot.kind.unbounded(a) for slot, a in zip(slots, about, strict=True)]
+    u, score = _descended(scores, np.stack([np.concatenate(parts) for parts in (first, *drawn)]), steps)
+    best = launched(u)
+    values = {slot.name: np.asarray(reference(slot, best)) for slot in slots}
+    found = expected_intervals(best.world, best.state, planned, free=free, noise=noise, observe=observe, dt=dt)
+    return Launch(best.world, best.state, values, found, score)
+
+
+def _descended(scores: Callable, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
+    """Descend from the starts u (S, n) along the gradient, each by steps of its own length: the best u, its score."""
+    length = np.full(len(u), 0.3)
     value, slope = scores(u)
     for _ in range(steps):
         size = np.sqrt((slope**2).sum(1, keepdims=True))
@@ -117,13 +131,10 @@ def best_launch(
         better = new < value
         u, slope = np.where(better[:, None], trial, u), np.where(better[:, None], new_slope, slope)
         value, length = np.where(better, new, value), length * np.where(better, GROW, SHRINK)
-    best = put(slots, scene, jnp.asarray(u[np.argmin(value)], scene.state.x.dtype))
-    values = {slot.name: np.asarray(reference(slot, best)) for slot in slots}
-    found = expected_intervals(best.world, best.state, planned, free=free, noise=noise, observe=observe, dt=dt)
-    return Launch(best.world, best.state, values, found, float(value.min()))
+    return u[np.argmin(value)], float(value.min())
 
 
-def _problem(world, state, states: Sequence[State], planned, free, noise, observe, dt) -> Problem:
+def _problem(world: World, state: State, states: Sequence[State], planned, free, noise, observe, dt) -> Problem:
     t = np.asarray(planned["t"], float)
     names = [name for name in planned if name != "t"]
     if missing := [name for name in names if name not in (noise or {})]:
@@ -142,40 +153,22 @@ def _shape(world: World, name: str, values: Any, t: np.ndarray, observe: Any) ->
     return (len(t), sizes.get(field, 1))
 
 
+def _linear(problem: Problem) -> Linear:
+    return linear_of(problem, point_at(problem.groups, make_starts(problem, 1, 0)), 0, Squares(), False)
+
+
 def _linears(problem: Problem) -> list[Linear]:
     """Linearisation of each record alone."""
-    point = point_at(problem.groups, make_starts(problem, 1, 0))
-    linear = linear_of(problem, point, 0, Squares(), False)
+    linear = _linear(problem)
     rows = zip(linear.rows, linear.slopes, linear.times, strict=True)
     return [Linear((r,), (J,), (t,), linear.shared, 1.0, False) for r, J, t in rows]
 
 
-def _blind(problem: Problem, record: int, linear: Linear) -> list[Blind]:
-    """Directions of z that a record does not determine."""
-    scene = scene_of(problem.runs[record])
-    values = [np.asarray(reference(slot, scene)) for slot in problem.slots]
-    return blind_directions(linear, coordinates(problem.slots, values))
-
-
-def _covariance(problem: Problem, record: int, linear: Linear) -> np.ndarray:
-    """Covariance of the shared numbers, infinite where a record does not determine them."""
-    blind, shared = _blind(problem, record, linear), slice(0, linear.shared)
-    return infinite_where_blind(from_jacobian(linear).covariance, blind, shared)
-
-
-def _score(covariance: np.ndarray) -> float:
-    """Mean logarithm of the standard deviations along the axes of the ellipsoid; large if one is infinite."""
+def _score(linear: Linear, places: Sequence[Coordinate]) -> float:
+    """Mean logarithm of the standard deviations along the axes of the ellipsoid; large where one is infinite."""
+    blind = blind_directions(linear, places)
+    covariance = infinite_where_blind(from_jacobian(linear).covariance, blind, slice(0, linear.shared))
     if not np.isfinite(covariance).all():
         return MANY
     sign, logarithm = np.linalg.slogdet(covariance)
     return float(0.5 * logarithm / len(covariance)) if sign > 0 and np.isfinite(logarithm) else MANY
-
-
-def _parameters(problem: Problem, record: int, linear: Linear) -> tuple[Parameter, ...]:
-    covariance, (z, _) = from_jacobian(linear).covariance, first_numbers(problem)
-    blind, scene, out = _blind(problem, record, linear), scene_of(problem.runs[record]), []
-    for slot, rows in pieces(problem.shared):
-        about, unseen = reference(slot, scene), unseen_of(blind, rows)
-        ends = interval_of(slot, z[rows], covariance[rows, rows], about, 1.959964, unseen)
-        out.append(Parameter(slot.name, *ends, unit_of(problem, slot), "expected"))
-    return tuple(out)
