@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.special import stdtrit
 from diffrigid.step import at_least_one
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, cost_of, levenberg
+from diffrigid.sysid.parameters import pieces
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import reach_of
 from diffrigid.sysid.summary import Parameter
@@ -61,8 +61,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
     """
     if at_least_one("points", points) % 2 == 0 or points < 3:
         raise ValueError(f"points is {points}: expected an odd number from 3 on, the fitted value in the middle")
-    index = _index(fit, name)
-    kind: Any = next(slot.kind for slot in fit.problem.shared if slot.name == name)
+    kind, index = _kind_and_index(fit, name)
     quantile = float(stdtrit(fit.uncertainty.freedom, 0.975))
     deviation = float(np.sqrt(fit.covariance[index, index]))
     half = WIDE * quantile * deviation if np.isfinite(deviation) and deviation < 10 else 5.0
@@ -121,14 +120,13 @@ def _rises(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
     return np.maximum(_costs(fit, index, z) - fit.costs[0], 0.0)
 
 
-def _index(fit: Fit, name: str) -> int:
-    first = 0
-    for slot in fit.problem.shared:
+def _kind_and_index(fit: Fit, name: str) -> tuple[Free, int]:
+    """Kind of a shared number, and its place in z."""
+    for slot, rows in pieces(fit.problem.shared):
         if slot.name == name:
             if slot.size != 1 or not isinstance(slot.kind, Free):
                 raise ValueError(f"profile: {name!r} is not one number; tie or fix its components first")
-            return first
-        first += slot.size
+            return slot.kind, rows.start
     raise ValueError(f"profile: no shared parameter {name!r}; there are {[slot.name for slot in fit.problem.shared]}")
 
 
