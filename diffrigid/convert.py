@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid import so2
+from diffrigid.moments import volume_properties
 from diffrigid.pytree import map_arrays, refuse_missing, replace
-from diffrigid.shapes import HalfSpace, dimension, traced, volume_properties, with_topology
+from diffrigid.shapes import HalfSpace, dimension, traced, with_topology
 
 TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: typed numbers have a few digits
 FLAT = 1e-9  # [-] of the largest principal inertia: a body with a smaller one has no thickness

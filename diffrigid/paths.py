@@ -28,8 +28,9 @@ from diffrigid import joint_motion, so2
 from diffrigid.convert import Numbers, known, nearest, numbers
 from diffrigid.forces import Gravity
 from diffrigid.joints import Revolute
+from diffrigid.moments import volume_properties
 from diffrigid.pytree import array_fields, letters_of, replace
-from diffrigid.shapes import BOUNDLESS, traced, volume_properties
+from diffrigid.shapes import BOUNDLESS, traced
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
 

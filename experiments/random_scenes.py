@@ -106,7 +106,8 @@ def build(structure, p):
     import jax.numpy as jnp
 
     import diffrigid as dr
-    from diffrigid.shapes import radius, vertices, volume_properties
+    from diffrigid.moments import volume_properties
+    from diffrigid.shapes import radius, vertices
     from diffrigid.state import rotations
 
     kinds, dim, dtype = KINDS[structure], int(structure[-1]), p["size"].dtype

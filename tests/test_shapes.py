@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 
 from diffrigid import shapes
 from diffrigid.hull import hull_edges, hull_faces
+from diffrigid.moments import volume_properties
 from diffrigid.pytree import replace
 from diffrigid.shape_checks import check_shape
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, Hull, Polygon, Sphere
@@ -26,7 +27,7 @@ TURN = {2: np.array([(3, -4), (4, 3)]) / 5, 3: np.array([(2, -1, 2), (2, 2, -1),
 @partial(jax.jit, static_argnames="dim")
 def mass_properties(shape, density, dim):
     """Mass, centre of mass, inertia."""
-    volume, center, gyration = shapes.volume_properties(shape, dim)
+    volume, center, gyration = volume_properties(shape, dim)
     return density * volume, center, density * volume * gyration
 
 
@@ -104,7 +105,7 @@ def test_records_of_two_classes_are_never_alike():
 
 def test_regular_polygons_tend_to_the_disc():
     for n in (12, 48):
-        volume, _, gyration = shapes.volume_properties(Polygon(vertices=circle(n)), 2)
+        volume, _, gyration = volume_properties(Polygon(vertices=circle(n)), 2)
         assert_allclose(gyration, 0.5 * (1 - 2 / 3 * math.sin(math.pi / n) ** 2), rtol=EXACT)
         missing = math.pi / 2 - volume * gyration  # 2 pi^3 / (3 n^2) (1 - O(pi^2 / n^2))
         assert_allclose(missing * n**2, 2 * math.pi**3 / 3, rtol=(math.pi / n) ** 2)
@@ -127,8 +128,8 @@ def test_capsule_against_quadrature(dim):
 
 def test_bodies_without_volume_have_a_gyration():
     rod = np.diag([0.0, 3.0, 3.0])  # length 6: 6^2 / 12
-    assert_allclose(shapes.volume_properties(Capsule(radius=0.0, half_length=3.0), 3)[2], rod)
-    assert_allclose(shapes.volume_properties(Box(half=np.array([3.0, 0.0, 0.0])), 3)[2], rod)
+    assert_allclose(volume_properties(Capsule(radius=0.0, half_length=3.0), 3)[2], rod)
+    assert_allclose(volume_properties(Box(half=np.array([3.0, 0.0, 0.0])), 3)[2], rod)
     grad = jax.grad(lambda half: mass_properties(Box(half=half), 1.0, 3)[0])(jnp.array([1.0, 0.0, 2.0]))
     assert_allclose(grad, [0.0, 16.0, 0.0])  # volume 8 a b c
 
@@ -195,7 +196,7 @@ def test_outline_is_the_rounded_core(shape, dim):
     if dim == 2:
         assert (lines[0] == lines[-1]).all()
         area = 0.5 * np.sum(lines[:-1, 0] * lines[1:, 1] - lines[:-1, 1] * lines[1:, 0])
-        assert_allclose(area, shapes.volume_properties(shape, 2)[0], rtol=(2 * math.pi / n) ** 2)
+        assert_allclose(area, volume_properties(shape, 2)[0], rtol=(2 * math.pi / n) ** 2)
 
 
 @solids

@@ -8,7 +8,8 @@ from diffrigid.convert import known
 from diffrigid.models.frames import Frame, onto
 from diffrigid.models.links import Mass, turned
 from diffrigid.models.xml import Reader
-from diffrigid.shapes import Box, Capsule, HalfSpace, Sphere, volume_properties
+from diffrigid.moments import volume_properties
+from diffrigid.shapes import Box, Capsule, HalfSpace, Sphere
 
 ALONG_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # the x axis of a capsule onto z
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}
