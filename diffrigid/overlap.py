@@ -6,13 +6,21 @@ two vertices (separating axes). For cores that overlap it is minus the least tra
 """
 
 import itertools
-from typing import Any, NamedTuple
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from diffrigid.convert import known
-from diffrigid.shapes import HalfSpace, edges, radius, vertices
+from diffrigid.shapes import UNEVEN, HalfSpace, edges, radius, traced, vertices
+from diffrigid.state import State
 from diffrigid.touch import rotated
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
+
+DEEP = 1e-4  # [-] of the smaller size: penetration at the start that is worth a warning
 
 
 class Outline(NamedTuple):
@@ -82,14 +90,32 @@ def _across(a: Outline, b: Outline) -> np.ndarray:
     return (to - share[:, :, None] * b.sides).reshape(-1, 3)
 
 
-def overlapping(colliders: dict[int, Outline], pairs: list, margin: float) -> list[tuple[int, int]]:
-    """Pairs (i, j) of keys of `colliders` that penetrate by more than `margin` of the smaller size."""
+def warn_of_overlap(world: "World", state: State, shapes: Mapping, solids: Mapping) -> None:
+    """Warn of pairs that penetrate at the start, except those with uneven ground or a traced value."""
+    poses = [*zip(state.x, state.q, strict=True), *zip(world.statics.x, world.statics.q, strict=True)]
+    placed = {}
+    for index, ((name, shape), (x, q)) in enumerate(zip(shapes.items(), poses, strict=True)):
+        solid = solids.get(name)
+        center = np.zeros(world.dim) if solid is None else solid.center
+        if shape is not None and not isinstance(shape, UNEVEN) and not traced((shape, center, x, q)):
+            placed[index] = place(shape, x, q, center)
+    pairs = [pair for group in world.pairs for pair in zip(group.a, group.b, strict=True)]
+    if world.crowd:
+        pairs = near_pairs(placed, len(world.names))
+    if deep := overlapping(placed, pairs):
+        names = list(shapes)
+        text = ", ".join(f"{names[i]} and {names[j]}" for i, j in sorted(deep))
+        warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore.", stacklevel=3)
+
+
+def overlapping(colliders: dict[int, Outline], pairs: list) -> list[tuple[int, int]]:
+    """Pairs (i, j) of keys of `colliders` that penetrate deeply."""
     size = {key: collider.size for key, collider in colliders.items()}
     centre = {key: collider.corners.mean(0) for key, collider in colliders.items()}
     deep = []
     for i, j in pairs:
         if i in size and j in size and np.linalg.norm(centre[i] - centre[j]) < size[i] + size[j]:
-            if separation(colliders[i], colliders[j]) < -margin * min(size[i], size[j]):
+            if separation(colliders[i], colliders[j]) < -DEEP * min(size[i], size[j]):
                 deep.append((i, j))
     return deep
 

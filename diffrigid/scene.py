@@ -1,6 +1,5 @@
 """`scene`: from bodies as users write them to `(World, State)`. All checks of values are made here."""
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
@@ -31,14 +30,13 @@ from diffrigid.convert import (
 )
 from diffrigid.forces import Gravity
 from diffrigid.joint_checks import joints_of, warn_of_torn_joints
-from diffrigid.overlap import near_pairs, overlapping, place
+from diffrigid.overlap import warn_of_overlap
 from diffrigid.pytree import map_arrays, refuse_missing, replace
 from diffrigid.shape_checks import check_shape
-from diffrigid.shapes import BOUNDLESS, UNEVEN, HeightField, Hull, Polygon, Shape, dimension, traced
+from diffrigid.shapes import BOUNDLESS, HeightField, Hull, Polygon, Shape, dimension, traced
 from diffrigid.state import COEFFICIENTS, Bodies, State
 from diffrigid.world import Offset, Statics, World
 
-OVERLAP = 1e-4  # [-] of the smaller size: penetration at the start that is worth a warning
 TURNING = {"rolling_friction", "spinning_friction"}
 RESERVED = (*COEFFICIENTS, "contact")  # paths, or the first part of one; and "gravity"
 
@@ -178,7 +176,7 @@ def scene(
         names=tuple(moving), static_names=tuple(still), own=tuple((k, own) for k, (_, own) in material.items()),
     )  # fmt: skip
     start = _state(moving, dim)
-    _warn_of_overlap(made, start, shapes, solids)
+    warn_of_overlap(made, start, shapes, solids)
     if not traced((made, start)):
         warn_of_torn_joints(made, start)
     return jax.tree.map(jax.device_put, (made, start))
@@ -340,21 +338,3 @@ def _contact(contact: Any) -> Contact:
         return array
 
     return map_arrays(check, contact, "contact")
-
-
-def _warn_of_overlap(world: World, state: State, shapes: Mapping, solids: Mapping) -> None:
-    """Warn of pairs that penetrate at the start, except those with uneven ground or a traced value."""
-    poses = [*zip(state.x, state.q, strict=True), *zip(world.statics.x, world.statics.q, strict=True)]
-    placed = {}
-    for index, ((name, shape), (x, q)) in enumerate(zip(shapes.items(), poses, strict=True)):
-        solid = solids.get(name)
-        center = np.zeros(world.dim) if solid is None else solid.center
-        if shape is not None and not isinstance(shape, UNEVEN) and not traced((shape, center, x, q)):
-            placed[index] = place(shape, x, q, center)
-    pairs = [pair for group in world.pairs for pair in zip(group.a, group.b, strict=True)]
-    if world.crowd:
-        pairs = near_pairs(placed, len(world.names))
-    if deep := overlapping(placed, pairs, OVERLAP):
-        names = list(shapes)
-        text = ", ".join(f"{names[i]} and {names[j]}" for i, j in sorted(deep))
-        warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore.", stacklevel=3)
