@@ -2,23 +2,19 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.collide import COLLIDERS, pair_groups
-from diffrigid.collide.distance import reach
-from diffrigid.collide.heights import cells_for
 from diffrigid.contact import Contact
 from diffrigid.contact.crowd import is_many
 from diffrigid.convert import (
-    Solid,
     angular_velocity,
     by_name,
     force_of,
-    known,
     mass_and_inertia,
     materials,
     nearest,
@@ -31,11 +27,12 @@ from diffrigid.convert import (
 from diffrigid.forces import Gravity
 from diffrigid.joint_checks import joints_of, warn_of_torn_joints
 from diffrigid.overlap import warn_of_overlap
-from diffrigid.pytree import map_arrays, refuse_missing, replace
+from diffrigid.pytree import map_arrays, refuse_missing
 from diffrigid.shape_checks import check_shape
-from diffrigid.shapes import BOUNDLESS, HeightField, Hull, Polygon, Shape, dimension, traced
+from diffrigid.shape_records import contact_count, looking_around, stack_shapes
+from diffrigid.shapes import BOUNDLESS, Shape, dimension, traced
 from diffrigid.state import COEFFICIENTS, Bodies, State
-from diffrigid.world import Offset, Statics, World
+from diffrigid.world import Statics, World
 
 TURNING = {"rolling_friction", "spinning_friction"}
 RESERVED = (*COEFFICIENTS, "contact")  # paths, or the first part of one; and "gravity"
@@ -152,9 +149,9 @@ def scene(
         raise ValueError(f"ignore is {ignore!r}: expected pairs of names, [('arm', 'hand')].")
     passing = _passing([*ignore, *joined], list(everything))
     shapes = {k: None if b.shape is None else shape_of(k, b.shape, dim) for k, b in everything.items()}
-    shapes |= _looking_around(shapes, moving)
+    shapes |= looking_around(shapes, moving)
     solids = {name: solid_of(shapes[name], dim) for name in moving}
-    records, offsets, owners = _stack_shapes(shapes, solids, dim)
+    records, offsets, owners = stack_shapes(shapes, solids, dim)
     kinds = [type(record) for record in records]
     numbers_of_all = restitution, friction, restitution_falloff, rolling_friction, spinning_friction
     material = materials(everything, dict(zip(COEFFICIENTS, numbers_of_all, strict=True)))
@@ -163,7 +160,7 @@ def scene(
     crowd = is_many(kinds, owners, n, not (named_forces or linked or passing or {*material} & TURNING))
     pairs: tuple = ()
     if not crowd:
-        pairs = pair_groups(kinds, owners, n, passing, COLLIDERS, lambda i, j: _count(records[i], records[j], dim))
+        pairs = pair_groups(kinds, owners, n, passing, COLLIDERS, partial(contact_count, records, dim))
     of_bodies, of_statics = ({k: c[part] for k, (c, _) in material.items()} for part in (slice(n), slice(n, None)))
     mass, inertia = zip(*(mass_and_inertia(k, b, solids[k], dim) for k, b in moving.items()), strict=True)
     made = World(
@@ -252,55 +249,6 @@ def _state(moving: Mapping[str, Body], dim: int) -> State:
     v = [numbers(f"{k}.v", np.zeros(dim) if b.v is None else b.v, (dim,)) for k, b in moving.items()]
     w = [angular_velocity(k, b.w, dim) for k, b in moving.items()]
     return State(**_poses(moving, dim), v=stack(v), w=stack(w))
-
-
-def _looking_around(shapes: Mapping[str, Any], moving: Mapping[str, Body]) -> dict[str, Any]:
-    """Height fields with `cells` filled in: how far to each side the bodies look."""
-    found = {}
-    for name, shape in shapes.items():
-        if not isinstance(shape, HeightField):
-            continue
-        sizes = [known(lambda s: reach(s, 3), shapes[body]) for body in moving if shapes[body] is not None]
-        parts = [known(cells_for, shape.spacing, size) for size in sizes]
-        if shape.cells is None and traced(parts):
-            raise ValueError(
-                f"{name}.shape.spacing or the size of a body is traced, so how far it looks around cannot be found: "
-                "give the HeightField cells=..., above the largest size of a body over the spacing by 1."
-            )
-        least = None if traced(parts) else int(max(parts, default=1))
-        if shape.cells is not None and least is not None and shape.cells < least:
-            raise ValueError(f"{name}.shape.cells is {shape.cells}: expected {least} or more, or leave it out.")
-        found[name] = replace(shape, cells=least if shape.cells is None else shape.cells)
-    return found
-
-
-def _stack_shapes(shapes: Mapping[str, Any], solids: Mapping[str, Solid | None], dim: int):
-    """Stack the shapes of each kind (type and static fields) in one record; with their offsets and owners.
-
-    A moving shape sits with its centre of mass, a static one with its origin, on the collider.
-    """
-    groups: dict[Any, list[tuple[int, Any, Any]]] = {}
-    for index, (name, shape) in enumerate(shapes.items()):
-        if shape is not None:
-            key = (jax.tree.structure(shape), tuple(leaf.shape for leaf in jax.tree.leaves(shape)))
-            solid = solids.get(name)
-            origin = np.zeros(dim, jnp.result_type(float)) if solid is None else -solid.center
-            groups.setdefault(key, []).append((index, shape, origin))
-    records, offsets, owners = [], [], []
-    for rows in groups.values():
-        owner, same, offset = zip(*rows, strict=True)
-        records.append(jax.tree.map(lambda *leaves: stack(leaves), *same))
-        owners.append(owner)
-        offsets.append(Offset(r=stack(offset)) if isinstance(same[0], Polygon | Hull) else None)
-    return tuple(records), tuple(offsets), tuple(owners)
-
-
-def _count(shape_a: Any, shape_b: Any, dim: int) -> int:
-    """Number of contacts that the pair function returns for these two kinds of shapes."""
-    x, q = np.zeros(dim, jnp.result_type(float)), np.zeros(2 if dim == 2 else 4, jnp.result_type(float))
-    a, b = (jax.tree.map(lambda leaf: leaf[0], shape) for shape in (shape_a, shape_b))
-    contacts = jax.eval_shape(COLLIDERS[type(a), type(b)], a, x, q, b, x, q)
-    return contacts.gap.shape[0]
 
 
 def _forces(forces: Any, gravity: Any, colliders: Mapping, moving: Mapping, dim: int) -> dict[str, Any]:
