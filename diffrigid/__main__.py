@@ -12,7 +12,7 @@ import diffrigid as dr
 from diffrigid.data import FRAME, SquareDrops, square_drops
 from diffrigid.state import State
 from diffrigid.sysid import command
-from diffrigid.view.report import Section, Series, chart, row, text_table, write_report
+from diffrigid.view.report import Curve, Section, chart, row, text_table, write_report
 
 SIGMA = 0.5  # [mm], [degrees] weight of a residual of a drop: about its size
 FINE = 4  # simulated and drawn steps of a drop per measured frame
@@ -194,7 +194,7 @@ def drop_charts(motions: Sequence[dr.Trajectory], record: SquareDrops, residuals
         charts += drop_curves(f"drop {k + 1} ({kind})", motions[k], record, k)
     for column, (name, unit) in enumerate((("x", "mm"), ("height", "mm"), ("angle", "degrees"))):
         label = f"fitted - measured [{unit}]"
-        lines = [Series(1e3 * record.t, each[:, column]) for each in residuals]
+        lines = [Curve(1e3 * record.t, each[:, column]) for each in residuals]
         charts.append(chart(f"Residuals of {name}, all drops", "time [ms]", label, lines))
     return charts
 
@@ -211,7 +211,7 @@ def drop_curves(title: str, motion: dr.Trajectory, record: SquareDrops, k: int) 
         ("Height", "mm", 1e3 * x[:, 1], 1e3 * record.x[k, :, 1]),
         ("Angle", "degrees", np.degrees(angle), np.degrees(record.angle[k])),
     ):
-        lines = [Series(1e3 * t[known], curve, "fitted"), Series(1e3 * record.t, points, "measured", 1, True)]
+        lines = [Curve(1e3 * t[known], curve, "fitted"), Curve(1e3 * record.t, points, "measured", 1, True)]
         charts.append(chart(f"{name}, {title}", "time [ms]", f"{name.lower()} [{unit}]", lines))
     return charts
 
@@ -273,11 +273,11 @@ def disc_charts(fit: dr.Fit, t: np.ndarray, measured: np.ndarray) -> list[str]:
     for axis, name in enumerate("xy"):
         lines = []
         for k, body in enumerate(fit.world.names):
-            lines += [Series(t, measured[:, k, axis], "", k, True), Series(t, x[:, k, axis], body, k)]
+            lines += [Curve(t, measured[:, k, axis], "", k, True), Curve(t, x[:, k, axis], body, k)]
         charts.append(chart(f"Position {name}", "time [s]", f"{name} [m]", lines))
     for axis, name in enumerate("xy"):
         away = 1e3 * (x - measured)[:, :, axis]
-        lines = [Series(t, away[:, k], body, k) for k, body in enumerate(fit.world.names)]
+        lines = [Curve(t, away[:, k], body, k) for k, body in enumerate(fit.world.names)]
         charts.append(chart(f"Residuals of {name}", "time [s]", "fitted - measured [mm]", lines))
     return charts
 

@@ -13,7 +13,7 @@ from pages import Page, parsed
 
 from diffrigid.__main__ import main
 from diffrigid.data import FRAME, square_drops
-from diffrigid.view.report import Series, chart, row, text_table
+from diffrigid.view.report import Curve, chart, row, text_table
 
 PUBLISHED = {  # range that the published values of the square, and their scatter, allow
     "square: restitution": (0.35, 0.6),
@@ -112,7 +112,7 @@ def test_tables_show_intervals_to_two_places():
 
 def test_charts_break_at_nan_and_escape_names():
     x = np.arange(5.0)
-    svg = chart("a < b", "t [s]", "x [m]", [Series(x, np.array([0.0, 1.0, np.nan, 1.0, 2.0]), "a & b")])
+    svg = chart("a < b", "t [s]", "x [m]", [Curve(x, np.array([0.0, 1.0, np.nan, 1.0, 2.0]), "a & b")])
     assert "a &lt; b" in svg and "a &amp; b" in svg
     assert re.search(r'class="line c0" d="M[^M]*M[^M]*"', svg)  # two pieces
     page = Page()

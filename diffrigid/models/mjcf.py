@@ -269,15 +269,8 @@ def _joint(model: Model, element: ElementTree.Element, name: str, parent: Link, 
     joint = _driven(model, reader, kind) if kind in ("hinge", "slide") else Joint(
         kind, str(reader.text("name", "")), reader.numbers("pos", 3, np.zeros(3))
     )  # fmt: skip
-    unimportant = (
-        *LOOKS,
-        "user",
-        "limited",
-        "actuatorfrclimited",
-        "springref",
-        "ref",
-        *(("axis",) if kind in ("ball", "free") else ()),
-    )
+    unimportant = [*LOOKS, "user", "limited", "actuatorfrclimited", "springref", "ref"]
+    unimportant += ["axis"] if kind in ("ball", "free") else []
     model.left_out += [text for text in reader.left_out(*unimportant) if not _is_zero(reader, text)]
     return joint
 

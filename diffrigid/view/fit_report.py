@@ -15,8 +15,7 @@ from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.table import HEADER, SHOWN, below, rows
 from diffrigid.trajectory import Trajectory
 from diffrigid.view.play import Player, play
-from diffrigid.view.report import Section, chart, matrix, write_report
-from diffrigid.view.report import Series as Curve
+from diffrigid.view.report import Curve, Section, chart, matrix, write_report
 
 if TYPE_CHECKING:
     from diffrigid.sysid.result import Fit

@@ -39,7 +39,7 @@ class Section:
 
 
 @dataclass(frozen=True)
-class Series:
+class Curve:
     """Points, or a line, of a chart; NaN is skipped."""
 
     x: np.ndarray
@@ -84,7 +84,7 @@ def html_table(rows: Sequence[Row], header: Row = HEADER) -> str:
 
 
 def chart(
-    title: str, x_label: str, y_label: str, series: Sequence[Series], width: int = WIDTH,
+    title: str, x_label: str, y_label: str, series: Sequence[Curve], width: int = WIDTH,
     events: Sequence[float] = (), margin: float = 0.0,
 ) -> str:  # fmt: skip
     """Draw a chart as SVG: axes with ticks, lines and points, a legend above.
@@ -184,7 +184,7 @@ def _axes(place, x_range, y_range, corner) -> list[str]:
     return parts
 
 
-def _marks(series: Series, place) -> str:
+def _marks(series: Curve, place) -> str:
     """Circles, or a line that is broken at NaN."""
     known = np.isfinite(series.x) & np.isfinite(series.y)
     x, y = place(series.x, series.y)
@@ -196,7 +196,7 @@ def _marks(series: Series, place) -> str:
     return f'<path class="line c{series.colour}" d="{path}"/>'
 
 
-def _legend(series: Sequence[Series], right: float) -> str:
+def _legend(series: Sequence[Curve], right: float) -> str:
     """Names of the series and their marks, at the top right."""
     named = [(f"c{s.colour}", "●" if s.points else "—", html.escape(s.name)) for s in series if s.name]
     spans = "&#160;&#160; ".join(f'<tspan class="mark {kind}">{mark}</tspan> {name}' for kind, mark, name in named)
