@@ -132,7 +132,7 @@ def materials(colliders: Mapping[str, Any], general: Mapping[str, Any]) -> dict[
             values = [rest if value is None else check(f"{name}.{field}", value) for name, value in own.items()]
             found[field] = stack(values), given
         elif field in ("restitution", "friction"):
-            raise ValueError(f"{field} is None: expected a number; 0 is none.")
+            raise ValueError(f"{field} is None: expected a number, 0 for none.")
     return found
 
 
@@ -262,7 +262,7 @@ def by_name(what: str, records: Any, taken: Iterable[str]) -> dict[str, Any]:
     for name in records:
         if not isinstance(name, str) or not name or "." in name or name in taken:
             raise ValueError(
-                f"{what}: {name!r} is no name, or is taken: expected a string without dots that no body, force or "
+                f"{what}: {name!r} is not a name, or is taken: expected a string without dots that no body, force or "
                 "joint has; choose another."
             )
     return dict(records)

@@ -176,7 +176,7 @@ def component(path: str) -> tuple[str, int | None]:
 def _item(vector: Array, path: str, index: int) -> Array:
     """Component `index` of a vector; `path` is that of the whole."""
     if not vector.ndim or index >= vector.shape[0]:
-        raise ValueError(f"{path}[{index}] is no number: {path} has the shape {vector.shape}.")
+        raise ValueError(f"{path}[{index}] is not a number: {path} has the shape {vector.shape}.")
     return _row(vector, index)
 
 

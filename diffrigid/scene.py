@@ -190,7 +190,8 @@ def _sorted(bodies: Mapping[str, Body | Static]) -> tuple[dict[str, Body], dict[
         if not isinstance(body, Body | Static):
             raise ValueError(f"bodies[{name!r}] is {body!r}: expected a Body or a Static around the shape.")
         if not isinstance(name, str) or not name or "." in name or name in (*RESERVED, "gravity"):
-            raise ValueError(f"bodies: {name!r} is no name: expected a string, no path, no dots; rename it.")
+            taken = ", ".join((*RESERVED, "gravity"))
+            raise ValueError(f"bodies: {name!r} is not a name: expected a string without dots, not {taken}; rename it.")
         if isinstance(body, Static) and body.shape is None:
             raise ValueError(f"{name}.shape is None: expected a shape; leave out a Static without one.")
         if isinstance(body, Body) and isinstance(body.shape, BOUNDLESS):

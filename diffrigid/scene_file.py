@@ -90,7 +90,7 @@ def read_scene(path: str | Path) -> SceneFile:
         with open(Path(path), "rb") as file:  # a Path, for a number would be an open file
             data = tomllib.load(file)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path} is no TOML file: {error}") from None
+        raise ValueError(f"{path} is not a TOML file: {error}") from None
     for key in data:
         if key not in (*TABLES, *ARGUMENTS):
             raise ValueError(f"{path}: unknown key {key!r}: {nearest(key, (*TABLES, *ARGUMENTS))}")
@@ -165,7 +165,7 @@ def _paths(key: str) -> str | tuple[str, ...]:
 def _options(where: str, entries: Mapping[str, Any]) -> dict[str, Any]:
     for key in entries:
         if key not in OPTIONS:
-            raise ValueError(f"{where}.{key} is no option: {nearest(key, OPTIONS)}")
+            raise ValueError(f"{where}.{key} is not an option: {nearest(key, OPTIONS)}")
     loss = {"loss": _named(f"{where}.loss", LOSSES, entries["loss"])} if "loss" in entries else {}
     return dict(entries) | loss
 

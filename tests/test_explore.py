@@ -58,8 +58,8 @@ def test_mistakes_are_named():
         ({"restitution": (1.0, 0.0)}, r"ranges\['restitution'\] is \(1, 0\): expected low < high"),
         ({"restitution": 1.0}, r"expected two numbers, \(low, high\)"),
         ({"restitution": (0.0, 0.5)}, r"restitution is 0.8, outside its range \(0, 0.5\)"),
-        ({"ball.v": (0.0, 1.0)}, r"ball.v is no number, .* choose one, as in 'ball.v\[0\]'"),
-        ({"ball.v[2]": (0.0, 1.0)}, r"ball.v\[2\] is no number"),
+        ({"ball.v": (0.0, 1.0)}, r"ball.v is not a number .* choose one, as 'ball.v\[0\]'"),
+        ({"ball.v[2]": (0.0, 1.0)}, r"ball.v\[2\] is not a number"),
         ({"bal.v[0]": (0.0, 1.0)}, "did you mean"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -273,7 +273,7 @@ MISTAKES = {
     "apart": (r"revolute does not hold at the start: it is off by 0\.5 .*move a body", dr.Revolute("arm", anchor_a=(0.0, 0.0), anchor_b=(1.0, 0.5))),
     "axis": (r"prismatic\.axis_b has no length", dr.Prismatic("arm", axis_b=(0.0, 0.0))),
     "shape": (r"revolute\.anchor_a has shape \(3,\)", dr.Revolute("arm", anchor_a=(0.0, 0.0, 0.0))),
-    "name": (r"joints: 'arm' is no name, or is taken", {"arm": dr.Ball("arm", anchor_a=(0.0, 0.0))}),
+    "name": (r"joints: 'arm' is not a name, or is taken", {"arm": dr.Ball("arm", anchor_a=(0.0, 0.0))}),
     "kind": (r"joints: 'float' is 3\.0: expected one of Revolute", 3.0),
 }  # fmt: skip
 

@@ -224,7 +224,7 @@ def test_limits_of_a_hinge_may_lie_beyond_half_a_turn(write):
 
 
 REFUSED = {
-    "no XML": ("<mujoco", "is no XML file"),
+    "no XML": ("<mujoco", "is not an XML file"),
     "another root": ("<robot/>", "starts with <robot>: expected <mujoco>"),
     "nothing": ("<mujoco/>", "bodies"),
     "two joints": (mjcf('<body name="a"><joint/><joint/><geom size="1"/></body>'), "'a' has 2 joints: expected one"),
@@ -247,8 +247,8 @@ REFUSED = {
     "include": ("<mujoco><include/></mujoco>", "an <include> has no file"),
     "frame": (mjcf("<frame/>" + BALL), "<frame> in 'world' cannot be loaded"),
     "global": (mjcf(BALL, '<compiler coordinate="global"/>'), "expected local"),
-    "a file that is cut short": ('<mujoco><include file="part.xml"/></mujoco>', "part.xml is no XML file"),
-    "a rope of 300 bodies": (mjcf('<body><joint/><geom size="1"/>' * 300 + "</body>" * 300), "is inside 200 elements"),
+    "a file that is cut short": ('<mujoco><include file="part.xml"/></mujoco>', "part.xml is not an XML file"),
+    "a rope of 300 bodies": (mjcf('<body><joint/><geom size="1"/>' * 300 + "</body>" * 300), "is nested in 200 elements"),
     "circle of files": ('<mujoco><include file="model.xml"/></mujoco>', "includes itself"),
 }  # fmt: skip
 
@@ -257,7 +257,7 @@ URDF_REFUSED = {
     "no mass": (ROBOT.replace("inertial>", "visual>"), "moves and has no mass"),
     "type": (ROBOT.replace('"continuous"', '"planar"'), "joint 'elbow' has the type 'planar'"),
     "parent": (ROBOT.replace('parent link="tip"', 'parent link="tap"'), "joint 'reach' has the parent 'tap'"),
-    "circle": (ROBOT.replace('child link="upper"', 'child link="base"'), "hang on each other in a circle"),
+    "circle": (ROBOT.replace('child link="upper"', 'child link="base"'), "form a loop"),
     "two parents": (ROBOT.replace('child link="lower"', 'child link="upper"'), "child of two joints"),
     "value": (ROBOT.replace('value="1.5"', 'value="heavy"'), "value is 'heavy': expected finite numbers"),
     "no value": (ROBOT.replace('<mass value="1.5"/>', ""), "<mass of inertial of upper> has no value: expected a number"),

@@ -71,7 +71,7 @@ def test_names_of_bodies_are_refused_or_read(count):
         try:
             world, state = dr.scene({name: dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0))}, gravity=(0.0, -9.81))
         except ValueError as error:
-            assert "is no name" in str(error)
+            assert "is not a name" in str(error)
             return
         for path in dr.paths.catalogue(world):
             dr.paths.read(world, state, path)

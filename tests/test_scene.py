@@ -79,7 +79,7 @@ MISTAKES = {
     "NaN in a shape": (r"ball\.shape\.radius is not finite", {"ball": ball(dr.Disc(radius=np.nan))}, {}),
     "NaN in gravity": (r"gravity is \[ 0\. nan\]: expected finite", {"ball": ball()}, {"gravity": (0.0, np.nan)}),
     "two dimensions": (r"all 2D or all 3D, but got \{'gravity': 3.*'ball\.x': 2", {"ball": ball()}, {"gravity": (0, 0, -9.81)}),
-    "no name": (r"bodies: 'a\.b' is no name: .* rename", {"a.b": ball()}, {}),
+    "no name": (r"bodies: 'a\.b' is not a name: .* rename", {"a.b": ball()}, {}),
     "nothing moves": (r"bodies has no Body, only \['floor'\]: .* add", {"floor": FLOOR}, {}),
     "ignored stranger": (r"ignore names 'bal', .* did you mean 'ball'", {"ball": ball(), "floor": FLOOR}, {"ignore": [("bal", "floor")]}),
     "force on a stranger": (

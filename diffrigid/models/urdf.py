@@ -35,7 +35,7 @@ def load_urdf(
         floating: the root moves freely; else it is fixed to the world.
 
     Raises:
-        ValueError: names the element and the attribute that cannot be read, links in a circle or without a mass.
+        ValueError: names the element and the attribute that cannot be read, links in a loop or without a mass.
 
     Warns:
         UserWarning: names all that is left out: meshes and cylinders do not collide, nor shapes off the centre of mass.
@@ -98,12 +98,12 @@ def _ordered(where: str, elements: dict, joints: dict) -> list[str]:
     """Names of the links, parents first, from the one root."""
     roots = [name for name in elements if name not in joints]
     if len(roots) != 1:
-        raise ValueError(f"{where} has the roots {roots}: expected one link that is no child of a joint.")
+        raise ValueError(f"{where} has the roots {roots}: expected exactly one link that is not the child of a joint.")
     out = [roots[0]]
     for name in out:
         out += [child for child, joint in joints.items() if _end(where, joint, "parent", elements) == name]
     if lost := [name for name in elements if name not in out]:
-        raise ValueError(f"{where}: links {lost} hang on each other in a circle: expected a tree.")
+        raise ValueError(f"{where}: links {lost} form a loop: expected a tree.")
     return out
 
 
@@ -122,7 +122,7 @@ def _end(where: str, joint: ElementTree.Element, end: str, links: Any) -> str:
 
 
 def _reader(where: str, label: str, parent: ElementTree.Element, tag: str) -> Reader:
-    """Reader of the attributes of a child, of none if there is no such child."""
+    """Reader of the attributes of a child element; it has none where there is no such child."""
     found = parent.find(tag)
     return Reader(where, f"{tag} of {label}", {} if found is None else dict(found.attrib))
 

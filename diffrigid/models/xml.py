@@ -15,19 +15,19 @@ def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
     """Root element of a file; with `root` None it may have any tag.
 
     Raises:
-        ValueError: it is no XML, its root is called otherwise, or elements are too deep inside each other.
+        ValueError: it is not XML, its root has another tag, or elements are nested too deeply.
     """
     try:
         found = ElementTree.parse(Path(path)).getroot()  # a Path, for a number would be an open file
     except (ElementTree.ParseError, UnicodeDecodeError, LookupError) as error:
-        raise ValueError(f"{path} is no XML file: {error}") from None
+        raise ValueError(f"{path} is not an XML file: {error}") from None
     if root is not None and found.tag != root:
         raise ValueError(f"{path} starts with <{found.tag}>: expected <{root}>.")
     level = [found]
     for _ in range(DEEPEST):
         level = [child for element in level for child in element]
     if level:
-        raise ValueError(f"{path}: <{level[0].tag}> is inside {DEEPEST} elements: expected fewer; divide the chain.")
+        raise ValueError(f"{path}: <{level[0].tag}> is nested in {DEEPEST} elements: expected fewer; divide the chain.")
     return found
 
 

@@ -55,7 +55,7 @@ def columns(
         if name in sizes:
             controls.append(Series(name, t, _filled(values, len(t), sizes[name], f"{where}[{name!r}]", world)))
             if not np.isfinite(controls[-1].values).all():
-                raise ValueError(f"{where}[{name!r}] has NaN: expected numbers, for a control acts all the time")
+                raise ValueError(f"{where}[{name!r}] has NaN: expected numbers in every row of a control")
             continue
         channel = channel_of(name, observe.get(name, name), world)
         values = _filled(values, len(t), channel.bias.shape[0], f"{where}[{name!r}]", world)
@@ -64,7 +64,7 @@ def columns(
     if unused := set(observe) - set(gathered):
         raise ValueError(f"observe: no column {sorted(unused)[0]!r} in {where}, there are {sorted(gathered)}")
     if not found:
-        raise ValueError(f"{where}: nothing is measured, there is no column beside the times")
+        raise ValueError(f"{where}: nothing is measured: expected a column beside the times")
     _refuse_units(found, channels, where)
     return tuple(found), channels, tuple(controls)
 
@@ -80,13 +80,13 @@ def read_csv(path: str | Path) -> dict[str, np.ndarray]:
         mark = next((mark for mark in ";\t" if lines and mark in lines[0]), ",")
         rows = list(csv.reader(lines, delimiter=mark))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is no CSV file: {error}") from None
+        raise ValueError(f"{path} is not a CSV file: {error}") from None
     if not rows:
         raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
     names, body = [name.strip() for name in rows[0]], rows[1:]
     for number, row in enumerate(body, start=2):
         if len(row) != len(names):
-            raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)} like the names")
+            raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)}, one for each name")
     try:
         if mark != ",":
             body = [[cell.replace(",", ".") for cell in row] for row in body]

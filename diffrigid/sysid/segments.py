@@ -102,7 +102,7 @@ def fit_in_pieces(
         options: others of `fit`, but for `windows`, which grow with the pieces, `observe` and `resume`.
 
     Raises:
-        ValueError: a body whose position is no column; one of those options.
+        ValueError: a body whose position is not a column; one of those options.
     """
     if taken := {"windows", "observe", "resume"} & set(options):
         raise ValueError(f"fit_in_pieces: expected no {min(taken)}: use segments and fit, as its module shows")
@@ -150,7 +150,7 @@ def _own_states(world: World, observations: Any) -> dict[str, Each]:
     """Free parameters that each piece has of its own: pose and velocity of the measured bodies.
 
     Raises:
-        ValueError: a body whose position is no column.
+        ValueError: a body whose position is not a column.
     """
     seen: dict[str, list[str]] = {}
     for channel in columns(world, observations, {})[1].values():

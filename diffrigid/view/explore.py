@@ -43,7 +43,7 @@ class Explorer:
         read = {name: paths.read(*self._start, name) for name in self.ranges}
         for name, value in read.items():
             if jnp.ndim(value):
-                raise ValueError(f"{name} is no number, it has the shape {value.shape}: choose one, as in '{name}[0]'")
+                raise ValueError(f"{name} is not a number but has the shape {value.shape}: choose one, as '{name}[0]'")
         self.values = {name: float(value) for name, value in read.items()}
         for name, (low, high) in self.ranges.items():
             if not low <= self.values[name] <= high:
@@ -118,7 +118,7 @@ def explore(
         An `Explorer`, which a notebook shows (pip install "diffrigid[notebook]").
 
     Raises:
-        ValueError: no such parameter, one that is no number, or one that starts outside its range.
+        ValueError: no such parameter, one that is not a number, or one that starts outside its range.
 
     Example:
         >>> dr.explore(world, state, {"restitution": (0, 1), "ball.v[1]": (-2, 2)}, dt=1 / 60, steps=30).values
