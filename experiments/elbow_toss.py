@@ -210,11 +210,8 @@ def _arrow(r, J, z, shared, damping):
     """Blocks of the normal equations of each toss: shared numbers, both, its own; and their gradients."""
     normal, gradient = J.swapaxes(1, 2) @ J, np.einsum("rmk,rm->rk", J, r)
     gradient[:, shared:] += 1e-4 * z[:, shared:]
-    normal = (
-        normal
-        + damping * np.eye(J.shape[2]) * np.diagonal(normal, axis1=1, axis2=2)[:, None]
-        + 1e-4 * np.eye(J.shape[2])
-    )
+    eye = np.eye(J.shape[2])
+    normal = normal + damping * eye * np.diagonal(normal, axis1=1, axis2=2)[:, None] + 1e-4 * eye
     A, B, D = normal[:, :shared, :shared], normal[:, :shared, shared:], normal[:, shared:, shared:]
     return A, B, D, gradient[:, :shared], gradient[:, shared:]
 
@@ -243,10 +240,8 @@ def errors(record: dict, tensor: np.ndarray, starts: np.ndarray, damping: float)
         points = len(values["friction"])
         each = {name: jnp.repeat(jnp.asarray(value, jnp.float32), count) for name, value in values.items()}
         flight = {name: each[name] for name in ("ratio", "inertia")} | {"damping": jnp.full(points * count, damping)}
-        world, materials = (
-            with_flight(board, flight, tensor),
-            {k: each[k][:, None] for k in ("friction", "restitution")},
-        )
+        world = with_flight(board, flight, tensor)
+        materials = {k: each[k][:, None] for k in ("friction", "restitution")}
         bodies = dr.replace(world.bodies, **{name: jnp.tile(value, (1, 2)) for name, value in materials.items()})
         hinge = dr.replace(world.joints[0], friction=each["hinge"][:, None])
         world = dr.replace(world, bodies=bodies, statics=dr.replace(world.statics, **materials), joints=(hinge,))
@@ -255,12 +250,10 @@ def errors(record: dict, tensor: np.ndarray, starts: np.ndarray, damping: float)
         distance = np.linalg.norm(x - record["x"], axis=-1) / (2 * HALF[0]) * 100
         # Link 2 where link 1 of the model has it with the measured angle: what is left is the error of the hinge.
         one, two = q[..., 0, :], q[..., 1, :]
-        wanted = np.asarray(
-            second(jnp.asarray(one), jnp.broadcast_to(jnp.asarray(record["angle"], one.dtype), one.shape[:3]))
-        )
-        return np.stack(
-            [part.mean(2) for part in (distance, angle_between(one, record["q"]), angle_between(two, wanted))], axis=-1
-        )
+        angle = jnp.broadcast_to(jnp.asarray(record["angle"], one.dtype), one.shape[:3])
+        wanted = np.asarray(second(jnp.asarray(one), angle))
+        parts = distance, angle_between(one, record["q"]), angle_between(two, wanted)
+        return np.stack([part.mean(2) for part in parts], axis=-1)
 
     return of
 

@@ -215,6 +215,7 @@ def one_batch(structure, dtype, programs, batch):
     import numpy as np
 
     made, forward, reverse = programs
+    eps = float(jnp.finfo(dtype).eps)
     p = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), draw(structure, batch))
     world, state = made(p)
     dt = jnp.asarray((1 / 60, 1 / 240)[batch % 2], dtype)
@@ -228,32 +229,36 @@ def one_batch(structure, dtype, programs, batch):
     def finite(tree):
         return np.logical_and.reduce([np.isfinite(leaf).reshape(BATCH, -1).all(1) for leaf in jax.tree.leaves(tree)])
 
-    energy, momentum, L, p_size, L_size, lift = map(np.asarray, jax.jit(jax.vmap(laws))(world, states))
-    eps = float(jnp.finfo(dtype).eps)
-    scale = np.abs(energy[:, :1]) + np.abs(lift).max(1, keepdims=True) + 1e-20
-    rise = (np.maximum.accumulate(energy[:, ::-1], 1)[:, ::-1][:, 1:] - energy[:, :-1]) / scale
-    off = np.abs(jnp.linalg.norm(states.q, axis=-1) - 1).reshape(BATCH, -1).max(1)
-    forward_slope = sum(
-        (w * leaf[:, -1]).reshape(BATCH, -1).sum(1)
-        for w, leaf in zip(*map(jax.tree.leaves, (weights, moved)), strict=True)
-    )
-    terms = [
-        np.asarray(a * b, float).reshape(BATCH, -1)
-        for a, b in zip(*map(jax.tree.leaves, (slopes, tangent)), strict=True)
-    ]
-    reverse_slope, size = sum(t.sum(1) for t in terms), sum(np.abs(t).sum(1) for t in terms)
-    size = size + sum(
-        np.abs(w * leaf[:, -1]).reshape(BATCH, -1).sum(1)
-        for w, leaf in zip(*map(jax.tree.leaves, (weights, moved)), strict=True)
-    )
-    unlike = np.abs(np.asarray(forward_slope) - reverse_slope) / (size + 1e-30)
+    def products(one, other):  # of all leaves: the terms of a sum over them, by world
+        pairs = zip(*map(jax.tree.leaves, (one, other)), strict=True)
+        return [(a * b).reshape(BATCH, -1) for a, b in pairs]
+
+    ahead = products(weights, jax.tree.map(lambda leaf: leaf[:, -1], moved))
+    back = [np.asarray(terms, float) for terms in products(slopes, tangent)]
+    size = sum(np.abs(terms).sum(1) for terms in back) + sum(np.abs(terms).sum(1) for terms in ahead)
+    unlike = np.abs(np.asarray(sum(t.sum(1) for t in ahead)) - sum(t.sum(1) for t in back)) / (size + 1e-30)
     found = {
         "finite forward": (~finite(states), np.zeros(BATCH)),
         "finite tangents": (~finite(moved), np.zeros(BATCH)),
         "finite gradients": (~finite(slopes), np.zeros(BATCH)),
+        "modes": (unlike > (1e-7 if eps < 1e-10 else 1e-2), unlike),
+    } | breaches(structure, world, states, eps)
+    return [(name, k, float(how[k])) for name, (bad, how) in found.items() for k in np.flatnonzero(bad)]
+
+
+def breaches(structure, world, states, eps):
+    """By law: in which worlds it is broken, and by how much."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    energy, momentum, L, p_size, L_size, lift = map(np.asarray, jax.jit(jax.vmap(laws))(world, states))
+    scale = np.abs(energy[:, :1]) + np.abs(lift).max(1, keepdims=True) + 1e-20
+    rise = (np.maximum.accumulate(energy[:, ::-1], 1)[:, ::-1][:, 1:] - energy[:, :-1]) / scale
+    off = np.abs(jnp.linalg.norm(states.q, axis=-1) - 1).reshape(BATCH, -1).max(1)
+    found = {
         "length of q": (off > 8 * eps, off),
         "energy": (rise.max(1) > 1e4 * eps + 1e-6, rise.max(1)),
-        "modes": (unlike > (1e-7 if eps < 1e-10 else 1e-2), unlike),
     }
     if structure not in FLOOR and not any(k.isupper() for k in KINDS[structure]):
         for name, sums, sizes in (("momentum", momentum, p_size), ("angular momentum", L, L_size)):
@@ -261,8 +266,7 @@ def one_batch(structure, dtype, programs, batch):
             found[name] = (off > max(200 * eps, SECOND_ORDER if structure in LINKED else 0.0), off)
     last = jax.tree.map(lambda leaf: np.asarray(leaf[:, -1], float), states)
     deep = np.array([depth(world, jax.tree.map(lambda leaf: leaf[k], last), k) for k in range(BATCH)])  # noqa: B023
-    found["penetration"] = (deep > 1e4 * eps + 1e-6, deep)
-    return [(name, k, float(how[k])) for name, (bad, how) in found.items() for k in np.flatnonzero(bad)]
+    return found | {"penetration": (deep > 1e4 * eps + 1e-6, deep)}
 
 
 def programs_of(structure):

@@ -25,12 +25,10 @@ NOISE = {"square.x": 5e-4, "square.angle": float(np.radians(0.5))}  # the size o
 
 
 def world_of(record):
-    half, inertia = (record.half, record.half), 2 / 3 * record.half**2
-    floor, drag = (
-        dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
-        dr.Drag(linear=record.drag, angular=record.spin_drag * inertia),
-    )
-    body = dr.Body(dr.Box(half=half), mass=1.0, inertia=inertia, x=(0.0, 1.0))
+    inertia = 2 / 3 * record.half**2
+    floor = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+    drag = dr.Drag(linear=record.drag, angular=record.spin_drag * inertia)
+    body = dr.Body(dr.Box(half=(record.half, record.half)), mass=1.0, inertia=inertia, x=(0.0, 1.0))
     return dr.scene(
         {"square": body, "floor": floor}, gravity=(0.0, -record.gravity), restitution=0.5, friction=0.1, forces=[drag]
     )
