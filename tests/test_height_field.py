@@ -228,11 +228,9 @@ LINE = np.array([(0.0, 0.5), (0.5, 0.5), (1.0, 0.1), (1.5, 0.0), (2.0, 0.4), (2.
 def test_a_profile_drawn_out_is_its_twin_in_the_plane(kind):
     """A ball, or a box that is wide across, that bounces, slides and turns over the same ground."""
     x, v, w, mass, inertia = (0.7, 1.2), (0.8, -0.5), -3.0, 1.3, 0.02
-    flat_shape, deep_shape = (
-        (dr.Disc(radius=0.2), dr.Sphere(radius=0.2))
-        if kind is dr.Sphere
-        else (dr.Box(half=(0.25, 0.15)), dr.Box(half=(0.25, 0.3, 0.15)))
-    )
+    round_ones = dr.Disc(radius=0.2), dr.Sphere(radius=0.2)
+    boxes = dr.Box(half=(0.25, 0.15)), dr.Box(half=(0.25, 0.3, 0.15))
+    flat_shape, deep_shape = round_ones if kind is dr.Sphere else boxes
     body = dr.Body(flat_shape, mass=mass, inertia=inertia, x=x, v=v, w=w)
     ground = dr.Static(dr.Profile(points=LINE))
     made = dr.scene({"body": body, "ground": ground}, gravity=(0.0, -G), restitution=0.5, friction=0.3)

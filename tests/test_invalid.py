@@ -324,10 +324,8 @@ def refused(call, *values):
         frame = error.__traceback__
         while frame.tb_next is not None:
             frame = frame.tb_next
-        file, line = (
-            frame.tb_frame.f_code.co_filename,
-            linecache.getline(frame.tb_frame.f_code.co_filename, frame.tb_lineno),
-        )
+        file = frame.tb_frame.f_code.co_filename
+        line = linecache.getline(file, frame.tb_lineno)
         ours = file.startswith(PACKAGE) and "raise" in line or isinstance(error, OSError) or "os.PathLike" in str(error)
         return (
             None if ours and str(error) else f"{type(error).__name__} from {Path(file).name}:{frame.tb_lineno}: {error}"

@@ -520,10 +520,8 @@ def test_a_number_that_is_seen_by_rounding_only_does_not_hold_up_the_others():
 
 def test_what_is_seen_of_an_inertia_has_an_interval():
     """Of three second moments the second is not seen: of the inertia, that about the second axis is without it."""
-    slot, about = (
-        Slot("die.inertia", ("die.inertia",), dr.inertia(principal=True), 3),
-        jnp.diag(jnp.array([3.0, 4.0, 5.0])),
-    )
+    slot = Slot("die.inertia", ("die.inertia",), dr.inertia(principal=True), 3)
+    about = jnp.diag(jnp.array([3.0, 4.0, 5.0]))
     unseen = unseen_of([Blind(np.array([0.0, 1.0, 0.0]), ("die.inertia",), "")], slice(0, 3))
     value, low, high = interval_of(slot, np.zeros(3), 1e-4 * np.eye(3), about, 2.0, unseen)
     assert_allclose(value, about, atol=1e-12)

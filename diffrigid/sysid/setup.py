@@ -123,9 +123,8 @@ def with_noise(
         window: [s] of each record from its start; None: as it is.
         width: [m] of smooth impacts; None: as it is. Until one is positive, only exact impacts are compiled.
     """
-    window, width = (
-        float(old if new is None else new) for old, new in ((problem.window, window), (problem.width, width))
-    )
+    window = problem.window if window is None else float(window)
+    width = problem.width if width is None else float(width)
     groups = []
     for group in problem.groups:
         weights = {}
