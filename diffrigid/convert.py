@@ -111,7 +111,7 @@ def coefficient(where: str, value: Any) -> Numbers:
     """Check and convert a coefficient of friction, or the fall-off of restitution."""
     array = numbers(where, value, ())
     if not traced(array) and not array >= 0:
-        raise ValueError(f"{where} is {float(array):g}: expected 0 or above; give it without sign.")
+        raise ValueError(f"{where} is {float(array):g}: expected 0 or above; drop the sign.")
     return array
 
 

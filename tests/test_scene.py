@@ -51,7 +51,7 @@ MISTAKES = {
     "angle in space": (r"brick\.angle: expected q", {"brick": brick(angle=0.1)}, {}),
     "restitution": (r"restitution is 1\.2: expected 0 .* to 1 .*; clip", {"ball": ball()}, {"restitution": 1.2}),
     "own restitution": (r"ball\.restitution is -0\.1: expected 0", {"ball": ball(restitution=-0.1)}, {}),
-    "friction": (r"friction is -0\.3: expected 0 or above; give it without sign", {"ball": ball()}, {"friction": -0.3}),
+    "friction": (r"friction is -0\.3: expected 0 or above; drop the sign", {"ball": ball()}, {"friction": -0.3}),
     "own friction": (r"ball\.friction is -1: expected 0 or above", {"ball": ball(friction=-1.0)}, {}),
     "falloff": (r"falloff is -1: expected 0 or above", {"ball": ball()}, {"restitution_falloff": -1.0}),
     "own falloff": (r"ball\.restitution_falloff is -1: expected 0", {"ball": ball(restitution_falloff=-1.0)}, {}),

@@ -164,7 +164,7 @@ def test_a_fit_that_is_none_says_so(records, column):
     r = records[0].observations
     data = {"t": r["t"], column: 1e3 * (r["p.x"] if column == "p.x" else r["p.x"][:, 1])}
     found = dr.fit(*point(), data, free={"gravity[1]": dr.interval(-20, 20)}, progress=False)
-    assert found.notes[0].startswith("this is no fit: residuals of p.x are as large")
+    assert found.notes[0].startswith("the fit failed: residuals of p.x are as large")
     again = found.with_intervals(sysid.from_jacobian)
     assert again.notes == found.notes
 

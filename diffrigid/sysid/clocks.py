@@ -16,8 +16,9 @@ from diffrigid.world import World
 def states_at(world: World, states: State, lengths: Array, controls: Any, times: Array) -> State:
     """States at times (K, 1 or B) [s] since the first, from those after each step.
 
-    One more step, of the missing time, from the state before: so what happens within it, even an impact, is included,
-    and the derivative with respect to time is the velocity. Before the start, the free flight that leads to it.
+    Each is reached by one more step, of the missing time, from the state before it: what happens within that step, even
+    an impact, is included, and the derivative with respect to time is the velocity. A time before the start is reached
+    on the free flight that leads to it.
 
     Args:
         states: (S+1, N, ..., B). lengths: (S, B) [s]. controls: of each step, (S, size, 1 or B) by name.
@@ -29,7 +30,7 @@ def states_at(world: World, states: State, lengths: Array, controls: Any, times:
     times = jnp.broadcast_to(times, (times.shape[0], lanes))
     ends = jnp.concatenate([jnp.zeros_like(lengths[:1]), jnp.cumsum(lengths, axis=0)])
     ends, count = lax.stop_gradient(ends), len(lengths)
-    before = (lax.stop_gradient(times)[:, None] > ends[None]).sum(1) - 1  # strictly: no step has no length
+    before = (lax.stop_gradient(times)[:, None] > ends[None]).sum(1) - 1  # strictly: so that no step has length 0
     before = jnp.clip(before, 0, count)
     missing = times - jnp.take_along_axis(ends, before, axis=0)
     late = missing > 0

@@ -10,12 +10,12 @@ from diffrigid.sysid.covariance import Linear, eliminated
 from diffrigid.sysid.free import Free
 
 ALIKE = 1e-8  # [-] eigenvalue of the scaled information below which effects are the same: a correlation of 1 - 1e-8
-ROUNDING = 1e-12  # [-] of the largest effect: a smaller one is none
+ROUNDING = 1e-12  # [-] of the largest effect: a smaller one counts as none
 SMALL = 0.05  # [-] parts of a direction below this share of its largest are rounding, each as large as its effect
 LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that hardly determines it
 RARE = 1e-3  # chance below which residuals are not taken for noise
 LAGS = 5  # largest lag of the autocorrelation of residuals
-ANY = 20.0  # standard deviation of a logarithm from which on the factor is not given
+ANY = 20.0  # standard deviation of a logarithm beyond which the factor is not quoted
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
 
 
 def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate]) -> list[str]:
-    """Notes on shared parameters that the data determine, but hardly."""
+    """Notes on shared parameters that the data barely determine."""
     deviation = np.sqrt(np.diag(covariance))
     hidden = [(c, s) for c, s in zip(coordinates, deviation, strict=True) if LARGE * c.scale < s < np.inf]
 
@@ -198,12 +198,12 @@ def doubts(series: Sequence[np.ndarray], expected: float | None, robust: bool = 
     out = []
     if (p := whiteness(series)) < RARE:
         out.append(
-            f"residuals follow each other (p = {p:.1g}), so intervals are too narrow: the model misses something, or "
+            f"residuals are autocorrelated (p = {p:.1g}), so intervals are too narrow: the model misses something, or "
             "the fit is in a local minimum (compare starts=16, or windows=)"
         )
     joined = np.concatenate([r[np.isfinite(r)] for r in series])
     if not robust and (p := normality(joined)) < RARE:
-        out.append(f"residuals are not normal (p = {p:.1g}): a robust loss, huber() or student(), minds the tails less")
+        out.append(f"residuals are not normal (p = {p:.1g}): huber() or student() would give the tails less weight")
     if expected is not None and len(joined) and (ratio := float(np.sqrt(np.mean(joined**2) / expected))) > 1.2:
         out.append(f"residuals are {ratio:.2g} times the noise that was given")
     return out

@@ -35,7 +35,7 @@ from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 
 SQUARES = Squares()
-ALIKE = 0.5, 1e-3  # of the loss, and of the best loss: a start that ends within their sum agrees with the best
+ALIKE = 0.5, 1e-3  # absolute, and relative to the best loss: a start that ends within their sum agrees with the best
 
 
 def fit(
@@ -74,17 +74,17 @@ def fit(
             is estimated from the residuals.
         observe: what a column observes if its name does not say so: {"tip": Marker("rod", point=(0.3, 0))}.
         widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets
-            starts that miss an impact find it. Default that of the world, 0 unless it was given another.
+            starts that miss an impact find it. Default: that of the world, 0 unless it was given another.
         windows: [s] of each record from its start, one fit after the other: (0.5, 1, 2, inf) leads into a long one.
         loss: `diffrigid.sysid.squares()`, `dr.huber()` or `dr.student()`.
         solver: default Levenberg-Marquardt; for many numbers `diffrigid.sysid.first_order(optax.adam(1e-2))` or
             `diffrigid.sysid.lbfgs()`.
         intervals: `diffrigid.sysid.from_jacobian`, `dr.sandwich` or `dr.bootstrap`.
-        iterations: at most, for each width and window; default 60, of other solvers as they were made. A fit that
-            has not converged after them says so.
+        iterations: at most, for each width and window; default 60, for other solvers the number they were made
+            with. A fit that has not converged by then says so.
         seed: of the random starts.
         resume: an earlier Fit, or what `load_fit` read: the first start is there.
-        progress: print a line as it goes; default: if the output is a terminal or a notebook.
+        progress: print a line as it goes; default: where the output is a terminal or a notebook.
 
     Interrupting it returns the best so far.
 

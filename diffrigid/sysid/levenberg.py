@@ -22,7 +22,7 @@ from diffrigid.linear import einsum
 from diffrigid.sysid.problem import Group, linearise
 
 FAINT = 1e-2  # [-] of the largest slope: a number with a smaller slope is damped as if it had this one
-DAMPING = (1e-9, 1e9)  # with FAINT the first holds numbers of slopes below 3e-7 of that: rounding, or yielding joints
+DAMPING = (1e-9, 1e9)  # least and most; the least holds slopes below 3e-7 of the largest: rounding, or yielding joints
 STIFF = 1e7  # a damping above which a start counts as converged
 SMALL = 1e-9  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
 SETTLED = 1e-8  # decrease of the cost, relative to it, below which an accepted step was the last

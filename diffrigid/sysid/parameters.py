@@ -41,8 +41,8 @@ class Slot:
     prior: Prior | None = None
 
     @property
-    def joint(self) -> bool:
-        """Whether the paths are parts of one vector, not names of one value."""
+    def is_vector(self) -> bool:
+        """Whether the paths are components of one vector, not several names of one value."""
         return isinstance(self.kind, Chart) and self.kind.name == "shares"
 
 
@@ -104,7 +104,7 @@ def _updated(node: Any, chain: tuple[str, ...], value: Array) -> Any:
 
 def reference(slot: Slot, scene: Scene) -> Array:
     """Value of a slot's parameter in a scene."""
-    if slot.joint:
+    if slot.is_vector:
         return jnp.stack([jnp.reshape(read(scene, path), ()) for path in slot.paths])
     return read(scene, slot.paths[0])
 
@@ -126,8 +126,8 @@ def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
     for slot, rows in pieces(slots):
         if slot.paths:
             value = slot.kind.value(z[rows], reference(slot, scene))
-            numbers += [(path, value[k] if slot.joint else value) for k, path in enumerate(slot.paths)]
-    # Bodies are moved along joints when anchors and velocities are as they will be.
+            numbers += [(path, value[k] if slot.is_vector else value) for k, path in enumerate(slot.paths)]
+    # In order: joints move bodies once anchors and velocities are as they will be.
     for path, value in sorted(numbers, key=lambda number: paths.order_of(scene.world, number[0])):
         scene = write(scene, path, value)
     return scene
@@ -142,7 +142,7 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
     """
     if not isinstance(free, Mapping) or not free:
         raise ValueError('free: nothing to fit; give paths, for example {"restitution": interval(0, 1)}')
-    # Records have mostly the same parameters.
+    # Most records have the same parameters.
     unlike = list({(jax.tree.structure((s.world, s.state)), tuple(s.channels)): s for s in scenes}.values())
     shared: list[Slot] = []
     own: list[Slot] = []
@@ -170,7 +170,7 @@ def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unli
         _refuse(names, having, scenes)
     _refuse_ambiguous(names, unlike)
     slot = Slot(" = ".join(names), names, kind, 0, prior)
-    if slot.joint:
+    if slot.is_vector:
         slot = replace(slot, name=" : ".join(names))
     shape = reference(slot, having[0]).shape
     size = kind.size(shape)

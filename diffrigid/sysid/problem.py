@@ -36,7 +36,7 @@ LITTLE = 10_000_000  # work in all records, starts and directions, up to which a
 class Plan:
     """Static description of a group of records, which is compiled in."""
 
-    slots: tuple[Slot, ...]  # shared ones first; those that no scene of the group has are without paths
+    slots: tuple[Slot, ...]  # shared ones first; those unknown to the scenes of the group have no paths
     clocked: tuple[str, ...]  # columns with times that are shifted
     priors: tuple[float, ...]  # of each slot: 1 / sqrt(records that share it)
 

@@ -48,7 +48,7 @@ class ProfileLikelihood:
 def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
     """Profile of a shared number, its interval being where the cost rises by less than t^2 / 2.
 
-    Unlike an interval from the Jacobian it knows of curvature: it may be lopsided, or open: where the rise does not
+    Unlike an interval from the Jacobian it accounts for curvature: it may be lopsided, or open. Where the rise does not
     reach that level, however far the number goes, the data give no limit and the interval ends at the bound.
 
     Args:

@@ -17,9 +17,9 @@ from diffrigid.sysid.records import Run
 from diffrigid.sysid.setup import Problem
 from diffrigid.world import World
 
-AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are autocorrelated, mean that there is no fit
+AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are autocorrelated, mean that the fit failed
 ANYWHERE = 0.25  # [-] of a turn: residuals of uniformly random angles are 1 / sqrt(12) of a turn
-OTHER = 1.1  # [-] change of the mass of a solid body, from which on an unchanged inertia is doubted
+OTHER = 1.1  # [-] change of the mass of a solid body beyond which an unchanged inertia is doubted
 TORN = 1e-3  # [m or rad] largest error of a joint at the fitted start without a remark
 
 
@@ -39,7 +39,7 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
     out = []
     if names:
         out.append(
-            f"this is no fit: residuals of {', '.join(dict.fromkeys(names))} are as large as the motion; look at units "
+            f"the fit failed: residuals of {', '.join(dict.fromkeys(names))} are as large as the motion; look at units "
             "(m, s, rad; degrees need scale=180 / pi) and at the values to begin with, or try more starts"
         )
     out += _torn(scenes[0]) + _light_inertia(problem, scenes[0])

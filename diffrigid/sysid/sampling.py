@@ -178,7 +178,7 @@ def _log_volume(slots: Sequence[Slot], z: Array, refer: Sequence[Array]) -> Arra
 def _side_by_side(parts: Sequence[tuple[Plan, tuple[int, ...]]], loss: Any, a: int, b: int) -> Any:
     """Make the cost of one z (n,), with its gradient by forward mode; `vmap` makes lanes on the last axis of it.
 
-    Inside, the batch axis is last: steps on a leading batch axis are slower.
+    Inside, the batch axis is last: steps with a leading batch axis are slower.
     """
 
     @jax.jit  # traced once, however often the loops around it are

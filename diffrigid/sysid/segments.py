@@ -99,7 +99,7 @@ def fit_in_pieces(
             in each piece as in `state`.
         free: of the whole record, the initial state among it.
         starts: of the fit in pieces; the whole record is fitted from the best.
-        options: others of `fit`, but for `windows`, which grow with the pieces, `observe` and `resume`.
+        options: others of `fit`, except `windows`, which grow with the pieces, `observe` and `resume`.
 
     Raises:
         ValueError: a body whose position is not a column; one of those options.
@@ -182,7 +182,7 @@ def _lost(first: Fit, whole: Fit) -> list[str]:
     ratio = sizes[worst][0] / sizes[worst][1]
     if ratio < LOST:
         return []
-    return [f"as one motion residuals of {worst} are {ratio:.2g} times those in pieces: it is lost, or the model wrong"]
+    return [f"residuals of {worst} are {ratio:.2g} times those in pieces: the motion is lost, or the model wrong"]
 
 
 def _rms(fit: Fit, name: str) -> float:

@@ -5,7 +5,7 @@ the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point
 
     COLUMN.bias     (size,)  what it reads where it should read 0, in its unit
     COLUMN.scale    [-]      what it reads per unit
-    COLUMN.clock    [s]      how far its clock is ahead: a time t of it is the time t - clock of the simulation
+    COLUMN.clock    [s]      how far its clock is ahead: its time t is t - clock in the simulation
 """
 
 import dataclasses
@@ -206,7 +206,7 @@ def channel_of(name: str, what: Any, world: World) -> Channel:
     """Make the channel of a column from what a user says that it observes.
 
     Args:
-        what: "ball.x", an observer, a Channel around one of them, or a function of the state.
+        what: "ball.x", an observer, a function of the state, or a Channel around one of these.
     """
     channel = what if isinstance(what, Channel) else Channel(observer=what)
     sizes = {"D": world.dim, "Q": 2 if world.dim == 2 else 4, "H": 3, "P": 2}
@@ -263,7 +263,7 @@ def _resolved(name: str, what: Any, world: World) -> Any:
 def _by_name(name: str, what: str, world: World) -> Any:
     """The observer of a body's or a joint's field, or of one number of it; a body alone stands for its position."""
     whole, index = component(what)
-    if index is not None and what != name:  # columns of that name are put together before
+    if index is not None and what != name:  # components by those names were joined before
         observer = _by_name(name, whole, world)
         if index >= (size := size_of(observer, world)) or isinstance(observer, JointPart):
             raise ValueError(f"observe[{name!r}] is {what!r}: {whole} has {size} numbers, from [0] on")

@@ -28,8 +28,8 @@ from diffrigid.sysid.records import Run, noise_guess, runs, series_of
 from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
 
-MANY = 50_000  # steps of a record, beyond which the unit of its times is doubted
-LEAST = 1e-9  # least noise that is estimated
+MANY = 50_000  # steps of a record beyond which the unit of its times is doubted
+LEAST = 1e-9  # smallest noise that is estimated, in the unit of its column
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def _resumed(found: list[Run], saved: Any, free: Mapping[Any, Any], places: Sequ
             if p is not None and not (p.records and place is None):
                 value = p.value[place] if p.records else p.value
                 for k, path in enumerate(slot.paths):
-                    scene = write(scene, path, jnp.asarray(value[k] if slot.joint else value, scene.state.x.dtype))
+                    scene = write(scene, path, jnp.asarray(value[k] if slot.is_vector else value, scene.state.x.dtype))
         out.append(replace(run, world=scene.world, state=scene.state, channels=scene.channels))
     return out
 
