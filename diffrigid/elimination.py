@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.branches import opaque_true, unfused
-from diffrigid.gathers import rows_or_zeros
+from diffrigid.gathers import rows
 
 ROUNDING = 1e2  # [-] times eps times the diagonal: where joints form loops, a pivot no larger counts as zero
 
@@ -149,15 +149,15 @@ def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
     tiny = rounding * jnp.stack([blocks[:count, e, e] for e in range(blocks.shape[1])], axis=1)
     factors, live = [], opaque_true(blocks)
     for level in plan.levels:
-        own = rows_or_zeros(blocks, level.blocks)
-        inverse, near = unfused(live, _inverse, own[:, 0], rows_or_zeros(tiny, level.pivots)), own[:, 1:]
+        own = rows(blocks, level.blocks)
+        inverse, near = unfused(live, _inverse, own[:, 0], rows(tiny, level.pivots)), own[:, 1:]
         ready = _product(inverse[:, None], near, 2)
         factors.append(Factor(inverse, ready))
         if level.kept:
             product = _product(jnp.swapaxes(near, 2, 3)[:, :, None], ready[:, None], 3)
             taken = product.reshape(-1, *product.shape[3:])
-            blocks = _less(rows_or_zeros(blocks, level.kept), taken, level.sums)
-            tiny = rows_or_zeros(tiny, level.kept_rows)
+            blocks = _less(rows(blocks, level.kept), taken, level.sums)
+            tiny = rows(tiny, level.kept_rows)
     return tuple(factors)
 
 
@@ -165,19 +165,19 @@ def substitute(plan: Plan, factors: tuple[Factor, ...], right: Array) -> Array:
     """Solve for a right-hand side (n, E, *batch)."""
     pivots, right = [], right[:, :, None]
     for level, factor in zip(plan.levels, factors, strict=True):
-        own = rows_or_zeros(right, level.pivots)
+        own = rows(right, level.pivots)
         pivots.append(own)
         if level.kept_rows:
             taken = _product(jnp.swapaxes(factor.near, 2, 3), own[:, None], 2)
             taken = taken.reshape(-1, *taken.shape[2:])
-            right = _less(rows_or_zeros(right, level.kept_rows), taken, level.row_sums)
+            right = _less(rows(right, level.kept_rows), taken, level.row_sums)
     x = right[:0]
     for level, factor, own in list(zip(plan.levels, factors, pivots, strict=True))[::-1]:
         found = _product(factor.inverse, own, 1)
         if level.after[0]:
-            found = found - _product(factor.near, rows_or_zeros(x, level.after), 2).sum(1)
+            found = found - _product(factor.near, rows(x, level.after), 2).sum(1)
         x = jnp.concatenate([x, found])
-    return rows_or_zeros(x, plan.places)[:, :, 0]
+    return rows(x, plan.places)[:, :, 0]
 
 
 def _inverse(matrix: Array, tiny: Array) -> Array:
@@ -208,4 +208,4 @@ def _product(a: Array, b: Array, axis: int) -> Array:
 
 def _less(values: Array, taken: Array, sums: tuple[tuple[int, ...], ...]) -> Array:
     """Subtract from each of the values (K, ...) those of `taken` that `sums` lists for it."""
-    return values if not sums[0] else values - rows_or_zeros(taken, sums).sum(1)
+    return values if not sums[0] else values - rows(taken, sums).sum(1)

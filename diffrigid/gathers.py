@@ -20,12 +20,16 @@ FEW, MANY = 12, 40  # terms up to which a sum is unrolled: where there are many 
 
 
 def rows(values: Array, index: tuple) -> Array:
-    """Gather values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples."""
-    first, flat = index[0], not isinstance(index[0], tuple)
-    if flat and index == (first,) * len(index):
-        return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))
-    if flat and index == tuple(range(first, first + len(index))):
-        return values[first : first + len(index)]
+    """Gather values[index] along the leading axis, for an index known when tracing: a tuple, or a tuple of tuples.
+
+    The index -1 stands for zeros.
+    """
+    first = index[0]
+    if not isinstance(first, tuple) and first >= 0:
+        if index == (first,) * len(index):
+            return jnp.broadcast_to(values[first : first + 1], (len(index), *values.shape[1:]))
+        if index == tuple(range(first, first + len(index))):
+            return values[first : first + len(index)]
     return _pick.bind(values, index=index, axis=0)
 
 
@@ -118,12 +122,6 @@ def first_highest(values: list[Array]) -> list[Array]:
         chosen.append(left & (value == highest))
         left = left & (value != highest)
     return chosen
-
-
-def rows_or_zeros(values: Array, index: tuple) -> Array:
-    """`rows`, where the index -1 stands for zeros."""
-    table = np.array(index)
-    return rows(values, index) if (table >= 0).all() else _pick.bind(values, index=index, axis=0)
 
 
 def pack(tree: Any, batch_rank: int) -> tuple[list[Array], Callable[[list[Array]], Any]]:

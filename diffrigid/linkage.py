@@ -32,7 +32,7 @@ from diffrigid.constraints import (
     placed,
 )
 from diffrigid.elimination import Factor, factorise, plan, substitute
-from diffrigid.gathers import rows_or_zeros
+from diffrigid.gathers import rows
 from diffrigid.joints import Pose
 from diffrigid.numerics import dot
 from diffrigid.pytree import array, pytree, static
@@ -84,7 +84,7 @@ def _blocks(so: ModuleType, ends: tuple[tuple[int, int], ...], sides: Array, mas
     entry = jax.vmap(jax.vmap(jax.vmap(dot, (None, 0)), (0, None)))
     own = entry(sides[:, 0], mobile[:, 0]) + entry(sides[:, 1], mobile[:, 1])
     sides, mobile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (sides, mobile))
-    shared = [entry(rows_or_zeros(sides, i), rows_or_zeros(mobile, j)) for i, j in _shared(ends, moving)]
+    shared = [entry(rows(sides, i), rows(mobile, j)) for i, j in _shared(ends, moving)]
     return jnp.concatenate([own, functools.reduce(jnp.add, shared)]) if shared else own
 
 
@@ -102,12 +102,12 @@ def _shared(ends: tuple[tuple[int, int], ...], moving: int) -> tuple:
 def to_sides(ends: tuple[tuple[int, int], ...], values: Array) -> Array:
     """Gather values of the bodies (N, ...) at the two ends of every joint, (n, 2, ...); zeros for statics."""
     moving = len(values)
-    return rows_or_zeros(values, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
+    return rows(values, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
 
 
 def _by_body(ends: tuple[tuple[int, int], ...], moving: int, by_sides: Array) -> Array:
     """Sum values for both bodies of every joint (n, 2, ...) over the joints of each moving body, (N, ...)."""
-    return rows_or_zeros(by_sides.reshape(-1, *by_sides.shape[2:]), _sides_of(ends, moving)).sum(1)
+    return rows(by_sides.reshape(-1, *by_sides.shape[2:]), _sides_of(ends, moving)).sum(1)
 
 
 @functools.cache

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from diffrigid.gathers import rows, rows_or_zeros, sum_rows
+from diffrigid.gathers import rows, sum_rows
 
 COUNT = 4
 VALUES = np.random.default_rng(0).normal(size=(COUNT, 3, 2))
@@ -15,9 +15,9 @@ CASES = {
     "run": (rows, (1, 2, 3)),
     "one": (rows, (2, 2, 2)),
     "table": (rows, ((0, 2), (1, 1), (3, 0))),
-    "zeros": (rows_or_zeros, (2, -1, 0, 0)),
-    "nothing": (rows_or_zeros, (-1, -1)),
-    "table with zeros": (rows_or_zeros, ((0, -1, 3), (2, 2, -1))),
+    "zeros": (rows, (2, -1, 0, 0)),
+    "nothing": (rows, (-1, -1)),
+    "table with zeros": (rows, ((0, -1, 3), (2, 2, -1))),
     "sums": (sum_rows, ((0, 2), (3, COUNT), (0, 1))),
     "sums of runs": (sum_rows, ((0, 1), (2, 3))),
 }
