@@ -16,13 +16,13 @@ from jax import lax
 
 from diffrigid.compiling import is_for_speed, uncollected
 from diffrigid.controls import as_controls, controlled
-from diffrigid.convert import numbers
+from diffrigid.convert import at_least_one, numbers
 from diffrigid.devices import cut, devices, join, on_cpu, over_devices, pieces_of
 from diffrigid.pytree import map_arrays
 from diffrigid.scan import MEMORY, aligned, final_state, scan_steps
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State
-from diffrigid.step import OPTIONS, at_least_one, floats, options_for, step_length
+from diffrigid.step import OPTIONS, floats, options_for, step_length
 from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
 
 LANES, LANES_GPU = 2**15, 2**23  # of a chunk: one for each contact, or more, and four for each body of its worlds

@@ -87,6 +87,13 @@ def known_number(where: str, value: Any) -> Numbers:
     return numbers(where, value, ())
 
 
+def at_least_one(where: str, count: Any) -> int:
+    """Check and convert a count of steps, of worlds, or of bytes."""
+    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
+        raise ValueError(f"{where} is {count!r}, expected an integer >= 1")
+    return int(count)
+
+
 def positive(where: str, value: Any, fix: str) -> Numbers:
     """Check and convert a number above zero."""
     array = numbers(where, value, ())

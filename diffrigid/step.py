@@ -13,7 +13,7 @@ from jax import Array, lax
 from diffrigid.compiling import LASTING, QUICK, is_for_speed, is_own_program, uncollected
 from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
-from diffrigid.convert import Numbers, largest, numbers
+from diffrigid.convert import Numbers, at_least_one, largest, numbers
 from diffrigid.devices import on_cpu
 from diffrigid.scan import MEMORY, advance, aligned, joined, scan_steps
 from diffrigid.shapes import traced
@@ -144,13 +144,6 @@ def step_length(dt: Any, state: State, batch: bool = False) -> Numbers:
     if not traced(length) and not ((length > 0) & (length < largest(length.dtype))).all():
         raise ValueError(f"dt is {length}, expected > 0 [s] and finite")
     return length
-
-
-def at_least_one(name: str, count: Any) -> int:
-    """Check a count of steps, of worlds, or of bytes, and return it as int."""
-    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
-        raise ValueError(f"{name} is {count!r}, expected an integer >= 1")
-    return int(count)
 
 
 def _given_substeps(substeps: Any, intervals: int) -> tuple[int, ...]:

@@ -93,7 +93,7 @@ def damping_of(e, stiffness):
     Schwager and Poeschel 2007.
     """
     low, high = 0.0, 0.999
-    for _ in range(40):
+    for _ in range(60):
         u = 0.5 * (low + high)
         w = math.sqrt(1 - u * u)
         rebound = math.exp(-u / w * (math.pi - math.atan2(2 * u * w, 1 - 2 * u * u)))

@@ -3,9 +3,8 @@
 Each engine is a function of (case, steps per second, options) that returns theta -> positions at the end, (N, 2) [m].
 """
 
-import math
-
 import numpy as np
+from peer_discs import damping_of
 
 STARTS, SEED, NEAR = 5, 0, 1e-3  # starts, and by how much of themselves their numbers differ
 RADIUS = {"one bounce": 0.1, "two discs": 0.4, "three discs": 0.4}  # [m]
@@ -112,17 +111,6 @@ def brax(name, rate, pipeline):
         return state.x.pos[:, ::2]
 
     return end
-
-
-def damping_of(e, stiffness):
-    """Damping of a spring that rebounds with e, where it can push and not pull. Source: Schwager and Poeschel 2007."""
-    low, high = 0.0, 0.999
-    for _ in range(60):
-        u = 0.5 * (low + high)
-        w = math.sqrt(1 - u * u)
-        rebound = math.exp(-u / w * (math.pi - math.atan2(2 * u * w, 1 - 2 * u * u)))
-        low, high = (u, high) if rebound > e else (low, u)
-    return 2 * u * math.sqrt(stiffness)
 
 
 def mjx(name, rate, stiffness):

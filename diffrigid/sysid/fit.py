@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from diffrigid.convert import numbers
+from diffrigid.convert import at_least_one, numbers
 from diffrigid.state import State
-from diffrigid.step import at_least_one
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.columns import check_mapping
 from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
@@ -22,15 +21,7 @@ from diffrigid.sysid.parameters import pieces
 from diffrigid.sysid.points import by_column, linear_of, row_mask
 from diffrigid.sysid.remarks import remarks_on
 from diffrigid.sysid.result import Fit
-from diffrigid.sysid.setup import (
-    LEAST,
-    Problem,
-    fitted_scenes,
-    make_problem,
-    make_starts,
-    reach_of,
-    with_noise,
-)
+from diffrigid.sysid.setup import LEAST, Problem, fitted_scenes, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 

@@ -16,7 +16,7 @@ from jax import Array
 
 from diffrigid.branches import choose
 from diffrigid.compiling import LASTING, uncollected
-from diffrigid.step import at_least_one
+from diffrigid.convert import at_least_one
 from diffrigid.sysid.levenberg import INTERRUPTED, UNFINISHED, Numbers, Point, point_at
 from diffrigid.sysid.problem import Group, Plan, residuals_of
 

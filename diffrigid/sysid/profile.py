@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import stdtrit
 
-from diffrigid.step import at_least_one
+from diffrigid.convert import at_least_one
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, cost_of, levenberg
 from diffrigid.sysid.parameters import pieces

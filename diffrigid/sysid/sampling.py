@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid.compiling import LASTING, uncollected
-from diffrigid.step import at_least_one
+from diffrigid.convert import at_least_one
 from diffrigid.sysid.covariance import inverse
 from diffrigid.sysid.intervals import coordinates_of, unit_of
 from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid import paths
+from diffrigid.convert import at_least_one
 from diffrigid.state import State, rotations
-from diffrigid.step import at_least_one
 from diffrigid.sysid.charts import rotation
 from diffrigid.sysid.columns import Series, columns
 from diffrigid.sysid.fit import fit

@@ -15,8 +15,9 @@ from jax import Array
 
 from diffrigid import paths
 from diffrigid.compiling import QUICK, uncollected
+from diffrigid.convert import at_least_one
 from diffrigid.state import State
-from diffrigid.step import at_least_one, floats, rollout, step_length
+from diffrigid.step import floats, rollout, step_length
 from diffrigid.trajectory import Trajectory
 from diffrigid.view.frames import record
 from diffrigid.view.play import Player, play
