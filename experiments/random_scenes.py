@@ -256,10 +256,7 @@ def breaches(structure, world, states, eps):
     scale = np.abs(energy[:, :1]) + np.abs(lift).max(1, keepdims=True) + 1e-20
     rise = (np.maximum.accumulate(energy[:, ::-1], 1)[:, ::-1][:, 1:] - energy[:, :-1]) / scale
     off = np.abs(jnp.linalg.norm(states.q, axis=-1) - 1).reshape(BATCH, -1).max(1)
-    found = {
-        "length of q": (off > 8 * eps, off),
-        "energy": (rise.max(1) > 1e4 * eps + 1e-6, rise.max(1)),
-    }
+    found = {"length of q": (off > 8 * eps, off), "energy": (rise.max(1) > 1e4 * eps + 1e-6, rise.max(1))}
     if structure not in FLOOR and not any(k.isupper() for k in KINDS[structure]):
         for name, sums, sizes in (("momentum", momentum, p_size), ("angular momentum", L, L_size)):
             off = np.abs(sums - sums[:, :1]).max((1, 2)) / (sizes.max(1) + 1e-30)

@@ -367,18 +367,7 @@ RUB = dict(e=0.7, mu=0.15, m=0.8, inertia=0.0032, r=0.1, x=0.0, y=0.7, vx=3.0, v
 PAIR = dict(e=0.8, mu=0.0, ma=1.0, mb=1.6, ra=0.12, rb=0.18, ia=0.007, ib=0.026)
 PLANAR = dict(xa=0.0, ya=0.0, xb=1.0, yb=0.15, vxa=2.0, vya=0.1, vxb=-0.3, vyb=0.05, wa=3.0, wb=-2.0)
 SPATIAL = dict(
-    xa=0.0,
-    ya=0.1,
-    za=-0.08,
-    xb=1.0,
-    vxa=2.0,
-    vya=0.1,
-    vxb=-0.3,
-    vzb=0.05,
-    wxa=1.0,
-    wya=-2.0,
-    wza=3.0,
-    wxb=1.5,
+    xa=0.0, ya=0.1, za=-0.08, xb=1.0, vxa=2.0, vya=0.1, vxb=-0.3, vzb=0.05, wxa=1.0, wya=-2.0, wza=3.0, wxb=1.5
 )
 BLOCK_ON_SLOPE = dict(mu=0.4, v=2.0, g=9.81, tilt=0.2, s=0.1, h=0.05, m=1.5)
 CASES = {

@@ -79,10 +79,7 @@ def test_a_parameter_nothing_depends_on_is_an_error():
         (lambda d: d | {"d0.y": d["d0.x"]}, "did you mean .d0"),
         (lambda d: d | {"d0.x": d["d0.x"][:5]}, r"expected \(120, 2\)"),
         (lambda d: d | {"t": d["t"][::-1]}, "increasing"),
-        (
-            lambda d: {k: v if k == "t" else np.full_like(v, np.nan) for k, v in d.items()},
-            "nothing is measured",
-        ),
+        (lambda d: {k: v if k == "t" else np.full_like(v, np.nan) for k, v in d.items()}, "nothing is measured"),
     ],
 )
 def test_bad_records(change, message):

@@ -271,9 +271,8 @@ def rocking(half, mu, e, angle, w):
     so, (a, b) = rotations(2), half
     inertia = (a**2 + b**2) / 3
     x = so.rotate(so.exp(angle[None]), half)
-    v = so.cross(w[None], x) * jnp.where(
-        mu > 0, 1.0, jnp.array([0.0, 1.0])
-    )  # without friction it slips below the centre
+    kept = jnp.where(mu > 0, 1.0, jnp.array([0.0, 1.0]))  # without friction it slips below the centre
+    v = so.cross(w[None], x) * kept
     body = dr.Body(dr.Box(half=half), mass=1.0, x=x, angle=angle, v=v, w=w)
     world, state = dr.scene({"box": body, "floor": floor()}, gravity=(0.0, -G), friction=mu, restitution=e)
     end = jax.tree.map(lambda leaf: leaf[-1, 0], dr.rollout(world, state, dt=1 / 240, steps=8).state)

@@ -234,11 +234,8 @@ def compiled_yard(dim):
     def states(turn, shift, friction, e):
         world, state = yard(dim, turn, shift, friction, e)
         states = dr.rollout(world, state, dt=1 / 60, steps=48).state
-        return (
-            states,
-            jax.vmap(lambda state: dr.kinetic_energy(world.bodies, state).sum())(states),
-            world.bodies.mass,
-        )
+        energy = jax.vmap(lambda state: dr.kinetic_energy(world.bodies, state).sum())(states)
+        return states, energy, world.bodies.mass
 
     return jax.jit(states)
 

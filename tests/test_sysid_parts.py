@@ -1,9 +1,6 @@
-"""The parts of a fit that have exact answers on their own: kinds, sensors, records, losses, tests of residuals, files."""
+"""The parts of a fit that have exact answers on their own: kinds, orders, losses, tests of residuals, tables."""
 
-import contextlib
-import io
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import diffrigid as dr
 from diffrigid import sysid
-from diffrigid.__main__ import main
 from diffrigid.impacts import order_of_impacts
-from diffrigid.scene_file import read_scene
-from diffrigid.step import steps_in
-from diffrigid.sysid.columns import columns, read_csv
 from diffrigid.sysid.diagnosis import Blind, coordinates, doubts, normality, whiteness
 from diffrigid.sysid.intervals import interval_of, unseen_of
 from diffrigid.sysid.levenberg import Numbers, Point, minimise
@@ -25,19 +18,8 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import in_words
 from diffrigid.sysid.parameters import Slot
 from diffrigid.sysid.sampling import Posterior
-from diffrigid.sysid.sensors import channel_of, difference, predict
 from diffrigid.sysid.summary import Parameter, Summary
 from diffrigid.sysid.table import BLIND, rows_of
-
-WORLD, STATE = dr.scene(
-    {
-        "cue": dr.Body(None, mass=1.0, inertia=1.0, x=(1.0, 2.0), angle=0.5, v=(3.0, 0.0)),
-        "ball": dr.Body(None, mass=2.0, inertia=1.0, x=(4.0, 6.0)),
-    }
-)
-SOLID, SOLID_STATE = dr.scene({"die": dr.Body(None, mass=1.0, inertia=(1.0, 1.0, 1.0), x=(0.2, -0.4, 5.0))})
-T = np.arange(6) / 10
-
 
 # ---- kinds of parameters
 
@@ -122,204 +104,8 @@ def test_a_posterior_of_a_component_prints_its_table():
     assert lines[2].startswith("a.v[1]") and "1.002" in lines[2] and "345" in lines[2]
 
 
-def test_a_clock_that_jitters_takes_one_step_for_each_frame():
-    """Times to a tenth of a millisecond, and in single precision."""
-    t = np.round(np.arange(60) / 60 * 1.0003, 4)
-    data = {"t": t, "cue.x": np.zeros((60, 2))}
-    problem = sysid.make_problem(WORLD, STATE, data, free={"cue.v": dr.real()})
-    assert problem.groups[0].data.lengths.shape[0] == 59
-    single = (np.arange(36, dtype=np.float32) / np.float32(30)).astype(float)
-    assert (steps_in(np.diff(single), 1 / 30) == 1).all() and steps_in(np.array([35 / 30]), np.float32(1 / 30)) == 35
-
-
 def test_a_start_at_zero_of_a_positive_parameter_is_moved_off():
     assert_allclose(np.exp(dr.positive().unbounded(np.array([0.0, 0.2]))), [1e-3, 0.2])
-
-
-# ---- sensors
-
-
-def reading(what, world=WORLD, state=STATE):
-    channel = jax.tree.map(jnp.asarray, channel_of("c", what, world))
-    return np.asarray(predict(channel, world, jax.tree.map(lambda leaf: leaf[None], state)))[0]
-
-
-def test_observers_read_what_geometry_says():
-    c, s = np.cos(0.5), np.sin(0.5)
-    point = (1.0 + 0.3 * c - 0.1 * s, 2.0 + 0.3 * s + 0.1 * c)
-    assert_allclose(reading("cue.x"), (1.0, 2.0))
-    assert_allclose(reading("cue.angle"), (0.5,))
-    assert_allclose(reading(dr.Marker("cue", point=(0.3, 0.1))), point)
-    assert_allclose(reading(dr.Separation("cue", dr.Marker("ball"))), (5.0,))
-    assert_allclose(reading(lambda state: state.x[1] - state.x[0]), (3.0, 4.0))
-    assert_allclose(reading(lambda state: state.v[0, 0]), (3.0,))
-    assert_allclose(reading(dr.Channel("cue.x", bias=(0.1, 0.0), scale=2.0)), (2.1, 4.0))
-    assert_allclose(reading("cue.x[1]"), (2.0,))
-    with pytest.raises(ValueError, match=r"cue.x has 2 numbers"):
-        reading("cue.x[2]")
-
-
-def test_cameras():
-    matrix = np.array([[200.0, 10.0, 5.0], [0.0, -150.0, 400.0], [0.1, 0.0, 1.0]])
-    u = matrix @ (1.0, 2.0, 1.0)
-    assert_allclose(reading(dr.Homography("cue", matrix=matrix)), u[:2] / u[2])
-    camera = dr.Pinhole("die", x=(0.0, 0.0, 1.0), q=(1.0, 0.0, 0.0, 0.0), focal=800.0, center=(320.0, 240.0))
-    assert_allclose(reading(camera, SOLID, SOLID_STATE), (320 + 800 * 0.2 / 4, 240 - 800 * 0.4 / 4))
-
-
-def test_angles_are_compared_up_to_full_turns():
-    states = jax.tree.map(lambda leaf: leaf[None], STATE)
-    channel = jax.tree.map(jnp.asarray, channel_of("cue.angle", "cue.angle", WORLD))
-    assert_allclose(difference(channel, WORLD, states, jnp.array([[0.4 + 6 * np.pi]])), [[0.1]], atol=1e-12)
-    channel = jax.tree.map(jnp.asarray, channel_of("cue.q", "cue.q", WORLD))
-    measured = jnp.array([[np.cos(0.4), np.sin(0.4)]])
-    assert_allclose(difference(channel, WORLD, states, measured), [[0.1]], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        ("cue.z", "did you mean"),
-        (dr.Marker("coe"), "did you mean 'cue'"),
-        (3.0, "expected 'ball.x', Marker"),
-        (dr.Marker("cue", point=(1.0, 2.0, 3.0)), "shape"),
-        (dr.Channel("cue.q", scale=2.0), "expected none for an orientation"),
-        (dr.Pinhole("cue", x=(0.0, 0.0), q=(2.0, 0.0), focal=800.0), "q has length 2: expected 1"),
-        (lambda state: state.x, "expected a number or a vector"),
-    ],
-)
-def test_bad_observers(what, message):
-    with pytest.raises(ValueError, match=message):
-        channel_of("c", what, WORLD)
-
-
-# ---- records
-
-
-class Table:
-    """What pandas looks like from here."""
-
-    columns = ("t", "cue.x[1]", "cue.angle")
-
-    def __getitem__(self, name):
-        return {"t": T, "cue.x[1]": T**2, "cue.angle": 0 * T}[name]
-
-
-def test_tables_files_and_dictionaries_say_the_same(tmp_path):
-    file = tmp_path / "data.csv"
-    rows = [f"{t},{t**2},{'' if k == 2 else 0.0}" for k, t in enumerate(T)]
-    file.write_text("\n".join(["t,cue.x[1],cue.angle", *rows]) + "\n")
-    for data in (Table(), file, read_csv(str(file))):
-        series, *_ = columns(WORLD, data, {})
-        x, angle = series
-        assert (x.name, angle.name) == ("cue.x", "cue.angle")
-        assert np.isnan(x.values[:, 0]).all()
-        assert_allclose(x.values[:, 1], T**2)
-        assert np.isnan(angle.values[2]).all() == (not isinstance(data, Table))
-
-
-def test_a_file_as_spreadsheets_write_it(tmp_path):
-    (tmp_path / "marked.csv").write_bytes(b"\xef\xbb\xbft,cue.x[0]\r\n0,1\r\n1,2\r\n")
-    assert list(read_csv(tmp_path / "marked.csv")) == ["t", "cue.x[0]"]
-    (tmp_path / "semicolons.csv").write_text("t;cue.x[0]\n0,5;1,5\n1;\n")
-    read = read_csv(tmp_path / "semicolons.csv")
-    assert_array_equal(read["t"], [0.5, 1.0])
-    assert_array_equal(read["cue.x[0]"], [1.5, np.nan])
-
-
-def test_columns_may_have_times_of_their_own():
-    slow = T[::2] + 0.03
-    series, *_ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
-    assert_allclose([s.t[-1] for s in series], [T[-1], slow[-1]])
-
-
-GOOD = {"t": T, "cue.x": np.zeros((6, 2))}
-
-
-@pytest.mark.parametrize(
-    ("data", "arguments", "message"),
-    [
-        ({"cue.x": np.zeros((6, 2))}, {}, 'expected a column "t"'),
-        ({"time": T, "cue.x": np.zeros((6, 2))}, {}, r"got \['time', 'cue.x'\]; rename"),
-        (GOOD | {"t": T[::-1]}, {}, "increasing times"),
-        (GOOD | {"cue.x": np.zeros((6, 3))}, {}, r"expected \(6, 2\) like t in this 2D world"),
-        (GOOD | {"cue.x[0]": T}, {}, "leave one out"),
-        ({"t": T, "cue.x[2]": T}, {}, r"component \[2\] of 2"),
-        (GOOD | {"cu.x": T}, {}, "did you mean 'cue.x'"),
-        (GOOD | {"ball.x": np.full((6, 2), np.nan)}, {}, "every value is NaN"),
-        ({"t": T, "cue.x": np.outer(T, (3.0, 0.0)), "cue.v": np.full((6, 2), 3000.0)}, {}, "metres and seconds"),
-        ({"t": T}, {}, "nothing is measured"),
-        ([], {}, "empty list"),
-        (5.0, {}, "expected a dict, a table or the path"),
-        (GOOD, {"noise": {"cue.y": 1.0}}, "no column 'cue.y'"),
-        (GOOD, {"noise": {"cue.x": 0.0}}, "above 0"),
-        (GOOD, {"noise": {"cue.x": np.ones(5)}}, "shape"),
-        (GOOD, {"observe": {"tip": "cue.x"}}, "no column 'tip'"),
-        (GOOD, {"starts": 0}, "integer >= 1"),
-        (GOOD, {"widths": ()}, "widths"),
-        (GOOD, {"windows": (0.0,)}, "windows"),
-        (GOOD, {"dt": -1.0}, "dt is -1: expected above 0"),
-        ([dr.Record(GOOD, start=0.2)], {}, "make it earlier"),
-        ([dr.Record(GOOD, world=SOLID)], {}, "2D|3D"),
-    ],
-)
-def test_bad_input_of_a_fit(data, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        dr.fit(WORLD, STATE, data, free={"cue.v": dr.real()}, progress=False, **arguments)
-
-
-@pytest.mark.parametrize(
-    ("free", "message"),
-    [
-        ({"tip.point": dr.real()}, "no parameter 'tip.point'"),
-        ({"cue.x": dr.direction(), "cue.mass": dr.direction()}, "expected a vector"),
-        ({("cue.mass",): dr.shares()}, "two or more"),
-        ({"cue.x": dr.each(3)}, "expected interval"),
-        ({"cue.mass": dr.positive(), "restitution": dr.real(), "cue.restitution": dr.real()}, "set the same number"),
-        ({"cue.q": dr.rotation(), "cue.angle": dr.real()}, "set the same number"),
-        ({"cue.v[0]": dr.real(), "cue.v": dr.real()}, "set the same number"),
-        ({"cue.v[2]": dr.real()}, r"cue.v\[2\] is not a number"),
-        ({"contact.width": dr.positive()}, "the widths to go through"),
-        ({"ball.v": dr.direction()}, "a direction that is not zero"),
-        ({"cue.mass": dr.interval(2, 3)}, "starts at 1.0, expected from 2 to 3"),
-    ],
-)
-def test_bad_parameters_of_a_fit(free, message):
-    with pytest.raises(ValueError, match=message):
-        dr.fit(WORLD, STATE, GOOD, free=free, progress=False)
-    with pytest.raises(ValueError, match="deviation"):
-        dr.prior(dr.real(), 0.0, 0.0)
-
-
-def test_a_component_of_a_vector_is_free_alone():
-    found = dr.fit(WORLD, STATE, GOOD, free={"cue.v[1]": dr.real()}, progress=False)
-    assert found["cue.v[1]"].unit == "m/s" and found.state.v[0, 0] == STATE.v[0, 0]
-
-
-def test_a_column_that_is_called_as_a_parameter_is_refused():
-    seen = {"die": dr.Pinhole(dr.Marker("die"), x=(0.0, 0.0, 0.0), q=(1.0, 0.0, 0.0, 0.0), focal=100.0)}
-    with pytest.raises(ValueError, match="give the column another name"):
-        dr.fit(
-            SOLID,
-            SOLID_STATE,
-            {"t": T, "die": np.ones((6, 2))},
-            observe=seen,
-            free={"die.x": dr.real()},
-            progress=False,
-        )
-
-
-def test_pieces_of_a_long_record_start_where_it_was_measured():
-    t = np.arange(41) / 20
-    data = {"t": t, "cue.x": np.stack([t, 2 - t], 1), "cue.angle": 0.5 + 4.0 * t}
-    pieces = dr.segments(WORLD, STATE, data, 4)
-    assert len(pieces) == 4 and pieces[0].state is STATE
-    assert_allclose([p.start for p in pieces], [0.0, 0.5, 1.0, 1.5])
-    for piece in pieces[1:]:
-        assert_allclose(piece.state.x[0], (piece.start, 2 - piece.start), atol=1e-9)
-        assert_allclose(piece.state.v[0], (1.0, -1.0), atol=1e-9)
-        assert_allclose(piece.state.w[0], 4.0, atol=1e-9)
-        assert_allclose(piece.observations["cue.x"][0][[0, -1]], (piece.start, piece.start + 0.5))
 
 
 # ---- order of impacts
@@ -371,128 +157,6 @@ def test_residuals_of_noise_are_believed_and_others_are_not():
     assert any("not normal" in text for text in doubts([noise[0] ** 3], None))
     assert not any("not normal" in text for text in doubts([noise[0] ** 3], None, robust=True))
     assert any("times the noise" in text for text in doubts([3 * noise[1]], 1.0))
-
-
-# ---- files
-
-SCENE = """
-gravity = [0.0, -9.81]
-restitution = 0.5
-ignore = [["a", "b"]]
-contact = { width = 0.01 }
-
-[bodies.a]
-shape = { disc = { radius = 0.1 } }
-mass = 1.0
-x = [0.0, 1.0]
-
-[bodies.b]
-mass = 2.0
-inertia = 0.1
-x = [3.0, 1.0]
-v = [1.0, 0.0]
-
-[statics.floor]
-shape = { half_space = { normal = [0.0, 1.0] } }
-
-[forces]
-air = { drag = { linear = 0.1 } }
-
-[joints]
-rod = { distance = { a = "b", anchor_a = [0.0, 0.0], anchor_b = [3.0, 2.0] } }
-
-[free]
-"b.v" = { each = "real" }
-"a.v" = { prior = ["real", [0.0, 1.0], 0.1] }
-restitution = { interval = [0, 1] }
-"a.mass = b.mass" = { positive = 0.2 }
-
-[observe]
-tip = { marker = { body = "b", point = [0.1, 0.0] } }
-far = { separation = { a = "a", b = { marker = { body = "b" } } } }
-
-[fit]
-starts = 2
-loss = { student = 3.0 }
-"""
-
-
-def test_a_scene_file_is_the_scene_it_describes(tmp_path):
-    file = tmp_path / "scene.toml"
-    file.write_text(SCENE)
-    found = read_scene(file)
-    world, state = dr.scene(
-        {
-            "a": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0)),
-            "b": dr.Body(None, mass=2.0, inertia=0.1, x=(3.0, 1.0), v=(1.0, 0.0)),
-            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
-        },
-        gravity=(0.0, -9.81), restitution=0.5, contact=dr.Contact(width=0.01), ignore=[("a", "b")],
-        forces={"air": dr.Drag(linear=0.1)},
-        joints={"rod": dr.Distance("b", anchor_a=(0.0, 0.0), anchor_b=(3.0, 2.0))},
-    )  # fmt: skip
-    assert jax.tree.structure((found.world, found.state)) == jax.tree.structure((world, state))
-    for ours, theirs in zip(jax.tree.leaves((found.world, found.state)), jax.tree.leaves((world, state)), strict=True):
-        assert_allclose(ours, theirs, rtol=1e-12)
-    free = {
-        "b.v": dr.each(dr.real()), "restitution": dr.interval(0, 1), ("a.mass", "b.mass"): dr.positive(0.2),
-        "a.v": dr.prior(dr.real(), [0.0, 1.0], 0.1),
-    }  # fmt: skip
-    assert found.free == free and found.options == {"starts": 2, "loss": dr.student(3.0)}
-    assert found.observe == {
-        "tip": dr.Marker("b", point=[0.1, 0.0]), "far": dr.Separation("a", dr.Marker("b")),
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (("[bodies.a]", "[bodys.a]"), "unknown key 'bodys': did you mean 'bodies'"),
-        (("disc = {", "disk = {"), "no 'disk': did you mean 'disc'"),
-        (("radius = 0.1", "radios = 0.1"), "no field 'radios': did you mean 'radius'"),
-        (('"real" }', '"reel" }'), "did you mean 'real'"),
-        (("starts = 2", "start = 2"), "did you mean 'starts'"),
-        (("mass = 1.0", "mass = "), "not a TOML file"),
-        (('{ each = "real" }', "3"), "free.b.v is 3: expected one kind"),
-        (('["real", [0.0, 1.0], 0.1]', '["real"]'), "expected { prior = "),
-        (("[fit]", "[columns]\nt = 3\n[fit]"), "columns.t is 3: expected the name of a column"),
-        (("student", "studend"), "fit.loss is 'studend': did you mean 'student'"),
-        (("body = ", "bodi = "), "no field 'bodi': did you mean 'body'"),
-        (("mass = 1.0", "masss = 1.0"), "no field 'masss': did you mean 'mass'"),
-        (("{ interval = [0, 1] }", "{}"), "free.restitution is {}: expected one kind"),
-        (("{ interval = [0, 1] }", "{ interval = [0] }"), "free.restitution: .*high"),
-        ((SCENE, "bodies = 3"), "bodies is 3: expected a table"),
-    ],
-)
-def test_mistakes_in_scene_files(tmp_path, change, message):
-    file = tmp_path / "scene.toml"
-    file.write_text(SCENE.replace(*change, 1))
-    with pytest.raises(ValueError, match=message):
-        read_scene(file)
-
-
-def test_fit_from_the_command_line(tmp_path):
-    """A fall: x = v t, y = 1 - g t^2 / 2."""
-    (tmp_path / "scene.toml").write_text(
-        'gravity = [0.0, -9.0]\n[bodies.p]\nmass = 1.0\ninertia = 1.0\nx = [0.0, 1.0]\n[free]\n"gravity" = "real"\n'
-        '[columns]\nt = { time = 0.001 }\n"p.x[0]" = "x"\n"p.x[1]" = "p.x[1]"\n'
-    )
-    lines = [f"{1e3 * t:.3f},0.0,{1 - 9.81 * t**2 / 2:.9f},7" for t in np.arange(12) / 20]
-    (tmp_path / "fall.csv").write_text("\n".join(["time,x,p.x[1],frame", *lines]) + "\n")
-    files, said = [str(tmp_path / name) for name in ("scene.toml", "fall.csv")], io.StringIO()
-    with contextlib.redirect_stdout(said):
-        assert main(["fit", *files, "--out", str(tmp_path / "fit.json"), "--report", str(tmp_path / "fit.html")]) == 0
-    assert "gravity[1]" in said.getvalue()
-    saved = dr.load_fit(tmp_path / "fit.json")
-    assert_allclose(saved["gravity"].value, (0.0, -9.81), atol=1e-6)
-    assert "scene: fall.csv" in (tmp_path / "fit.html").read_text(encoding="utf-8")
-    with pytest.raises(SystemExit), contextlib.redirect_stderr(said):
-        main(["fit", files[0], str(Path(tmp_path) / "none.csv")])
-    assert "none.csv" in said.getvalue()
-    (tmp_path / "other.csv").write_text("times,x,p.x[1]\n0,0,0\n1,0,0\n")
-    with pytest.raises(SystemExit), contextlib.redirect_stderr(said):
-        main(["fit", files[0], str(tmp_path / "other.csv")])
-    assert "has no column 'time', which is 't' here: did you mean 'times'?" in said.getvalue()
 
 
 # ---- numbers that are hardly seen, or not

@@ -1,0 +1,212 @@
+"""What columns observe and records hold, and what is refused of them and of the arguments of a fit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import diffrigid as dr
+from diffrigid import sysid
+from diffrigid.step import steps_in
+from diffrigid.sysid.columns import columns, read_csv
+from diffrigid.sysid.sensors import channel_of, difference, predict
+
+WORLD, STATE = dr.scene(
+    {
+        "cue": dr.Body(None, mass=1.0, inertia=1.0, x=(1.0, 2.0), angle=0.5, v=(3.0, 0.0)),
+        "ball": dr.Body(None, mass=2.0, inertia=1.0, x=(4.0, 6.0)),
+    }
+)
+SOLID, SOLID_STATE = dr.scene({"die": dr.Body(None, mass=1.0, inertia=(1.0, 1.0, 1.0), x=(0.2, -0.4, 5.0))})
+T = np.arange(6) / 10
+
+
+# ---- sensors
+
+
+def reading(what, world=WORLD, state=STATE):
+    channel = jax.tree.map(jnp.asarray, channel_of("c", what, world))
+    return np.asarray(predict(channel, world, jax.tree.map(lambda leaf: leaf[None], state)))[0]
+
+
+def test_observers_read_what_geometry_says():
+    c, s = np.cos(0.5), np.sin(0.5)
+    point = (1.0 + 0.3 * c - 0.1 * s, 2.0 + 0.3 * s + 0.1 * c)
+    assert_allclose(reading("cue.x"), (1.0, 2.0))
+    assert_allclose(reading("cue.angle"), (0.5,))
+    assert_allclose(reading(dr.Marker("cue", point=(0.3, 0.1))), point)
+    assert_allclose(reading(dr.Separation("cue", dr.Marker("ball"))), (5.0,))
+    assert_allclose(reading(lambda state: state.x[1] - state.x[0]), (3.0, 4.0))
+    assert_allclose(reading(lambda state: state.v[0, 0]), (3.0,))
+    assert_allclose(reading(dr.Channel("cue.x", bias=(0.1, 0.0), scale=2.0)), (2.1, 4.0))
+    assert_allclose(reading("cue.x[1]"), (2.0,))
+    with pytest.raises(ValueError, match=r"cue.x has 2 numbers"):
+        reading("cue.x[2]")
+
+
+def test_cameras():
+    matrix = np.array([[200.0, 10.0, 5.0], [0.0, -150.0, 400.0], [0.1, 0.0, 1.0]])
+    u = matrix @ (1.0, 2.0, 1.0)
+    assert_allclose(reading(dr.Homography("cue", matrix=matrix)), u[:2] / u[2])
+    camera = dr.Pinhole("die", x=(0.0, 0.0, 1.0), q=(1.0, 0.0, 0.0, 0.0), focal=800.0, center=(320.0, 240.0))
+    assert_allclose(reading(camera, SOLID, SOLID_STATE), (320 + 800 * 0.2 / 4, 240 - 800 * 0.4 / 4))
+
+
+def test_angles_are_compared_up_to_full_turns():
+    states = jax.tree.map(lambda leaf: leaf[None], STATE)
+    channel = jax.tree.map(jnp.asarray, channel_of("cue.angle", "cue.angle", WORLD))
+    assert_allclose(difference(channel, WORLD, states, jnp.array([[0.4 + 6 * np.pi]])), [[0.1]], atol=1e-12)
+    channel = jax.tree.map(jnp.asarray, channel_of("cue.q", "cue.q", WORLD))
+    measured = jnp.array([[np.cos(0.4), np.sin(0.4)]])
+    assert_allclose(difference(channel, WORLD, states, measured), [[0.1]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("cue.z", "did you mean"),
+        (dr.Marker("coe"), "did you mean 'cue'"),
+        (3.0, "expected 'ball.x', Marker"),
+        (dr.Marker("cue", point=(1.0, 2.0, 3.0)), "shape"),
+        (dr.Channel("cue.q", scale=2.0), "expected none for an orientation"),
+        (dr.Pinhole("cue", x=(0.0, 0.0), q=(2.0, 0.0), focal=800.0), "q has length 2: expected 1"),
+        (lambda state: state.x, "expected a number or a vector"),
+    ],
+)
+def test_bad_observers(what, message):
+    with pytest.raises(ValueError, match=message):
+        channel_of("c", what, WORLD)
+
+
+# ---- records
+
+
+class Table:
+    """What pandas looks like from here."""
+
+    columns = ("t", "cue.x[1]", "cue.angle")
+
+    def __getitem__(self, name):
+        return {"t": T, "cue.x[1]": T**2, "cue.angle": 0 * T}[name]
+
+
+def test_tables_files_and_dictionaries_say_the_same(tmp_path):
+    file = tmp_path / "data.csv"
+    rows = [f"{t},{t**2},{'' if k == 2 else 0.0}" for k, t in enumerate(T)]
+    file.write_text("\n".join(["t,cue.x[1],cue.angle", *rows]) + "\n")
+    for data in (Table(), file, read_csv(str(file))):
+        series, *_ = columns(WORLD, data, {})
+        x, angle = series
+        assert (x.name, angle.name) == ("cue.x", "cue.angle")
+        assert np.isnan(x.values[:, 0]).all()
+        assert_allclose(x.values[:, 1], T**2)
+        assert np.isnan(angle.values[2]).all() == (not isinstance(data, Table))
+
+
+def test_a_file_as_spreadsheets_write_it(tmp_path):
+    (tmp_path / "marked.csv").write_bytes(b"\xef\xbb\xbft,cue.x[0]\r\n0,1\r\n1,2\r\n")
+    assert list(read_csv(tmp_path / "marked.csv")) == ["t", "cue.x[0]"]
+    (tmp_path / "semicolons.csv").write_text("t;cue.x[0]\n0,5;1,5\n1;\n")
+    read = read_csv(tmp_path / "semicolons.csv")
+    assert_array_equal(read["t"], [0.5, 1.0])
+    assert_array_equal(read["cue.x[0]"], [1.5, np.nan])
+
+
+def test_columns_may_have_times_of_their_own():
+    slow = T[::2] + 0.03
+    series, *_ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
+    assert_allclose([s.t[-1] for s in series], [T[-1], slow[-1]])
+
+
+GOOD = {"t": T, "cue.x": np.zeros((6, 2))}
+
+
+@pytest.mark.parametrize(
+    ("data", "arguments", "message"),
+    [
+        ({"cue.x": np.zeros((6, 2))}, {}, 'expected a column "t"'),
+        ({"time": T, "cue.x": np.zeros((6, 2))}, {}, r"got \['time', 'cue.x'\]; rename"),
+        (GOOD | {"t": T[::-1]}, {}, "increasing times"),
+        (GOOD | {"cue.x": np.zeros((6, 3))}, {}, r"expected \(6, 2\) like t in this 2D world"),
+        (GOOD | {"cue.x[0]": T}, {}, "leave one out"),
+        ({"t": T, "cue.x[2]": T}, {}, r"component \[2\] of 2"),
+        (GOOD | {"cu.x": T}, {}, "did you mean 'cue.x'"),
+        (GOOD | {"ball.x": np.full((6, 2), np.nan)}, {}, "every value is NaN"),
+        ({"t": T, "cue.x": np.outer(T, (3.0, 0.0)), "cue.v": np.full((6, 2), 3000.0)}, {}, "metres and seconds"),
+        ({"t": T}, {}, "nothing is measured"),
+        ([], {}, "empty list"),
+        (5.0, {}, "expected a dict, a table or the path"),
+        (GOOD, {"noise": {"cue.y": 1.0}}, "no column 'cue.y'"),
+        (GOOD, {"noise": {"cue.x": 0.0}}, "above 0"),
+        (GOOD, {"noise": {"cue.x": np.ones(5)}}, "shape"),
+        (GOOD, {"observe": {"tip": "cue.x"}}, "no column 'tip'"),
+        (GOOD, {"starts": 0}, "integer >= 1"),
+        (GOOD, {"widths": ()}, "widths"),
+        (GOOD, {"windows": (0.0,)}, "windows"),
+        (GOOD, {"dt": -1.0}, "dt is -1: expected above 0"),
+        ([dr.Record(GOOD, start=0.2)], {}, "make it earlier"),
+        ([dr.Record(GOOD, world=SOLID)], {}, "2D|3D"),
+    ],
+)
+def test_bad_input_of_a_fit(data, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        dr.fit(WORLD, STATE, data, free={"cue.v": dr.real()}, progress=False, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        ({"tip.point": dr.real()}, "no parameter 'tip.point'"),
+        ({"cue.x": dr.direction(), "cue.mass": dr.direction()}, "expected a vector"),
+        ({("cue.mass",): dr.shares()}, "two or more"),
+        ({"cue.x": dr.each(3)}, "expected interval"),
+        ({"cue.mass": dr.positive(), "restitution": dr.real(), "cue.restitution": dr.real()}, "set the same number"),
+        ({"cue.q": dr.rotation(), "cue.angle": dr.real()}, "set the same number"),
+        ({"cue.v[0]": dr.real(), "cue.v": dr.real()}, "set the same number"),
+        ({"cue.v[2]": dr.real()}, r"cue.v\[2\] is not a number"),
+        ({"contact.width": dr.positive()}, "the widths to go through"),
+        ({"ball.v": dr.direction()}, "a direction that is not zero"),
+        ({"cue.mass": dr.interval(2, 3)}, "starts at 1.0, expected from 2 to 3"),
+    ],
+)
+def test_bad_parameters_of_a_fit(free, message):
+    with pytest.raises(ValueError, match=message):
+        dr.fit(WORLD, STATE, GOOD, free=free, progress=False)
+    with pytest.raises(ValueError, match="deviation"):
+        dr.prior(dr.real(), 0.0, 0.0)
+
+
+def test_a_component_of_a_vector_is_free_alone():
+    found = dr.fit(WORLD, STATE, GOOD, free={"cue.v[1]": dr.real()}, progress=False)
+    assert found["cue.v[1]"].unit == "m/s" and found.state.v[0, 0] == STATE.v[0, 0]
+
+
+def test_a_column_that_is_called_as_a_parameter_is_refused():
+    seen = {"die": dr.Pinhole(dr.Marker("die"), x=(0.0, 0.0, 0.0), q=(1.0, 0.0, 0.0, 0.0), focal=100.0)}
+    data, free = {"t": T, "die": np.ones((6, 2))}, {"die.x": dr.real()}
+    with pytest.raises(ValueError, match="give the column another name"):
+        dr.fit(SOLID, SOLID_STATE, data, observe=seen, free=free, progress=False)
+
+
+def test_pieces_of_a_long_record_start_where_it_was_measured():
+    t = np.arange(41) / 20
+    data = {"t": t, "cue.x": np.stack([t, 2 - t], 1), "cue.angle": 0.5 + 4.0 * t}
+    pieces = dr.segments(WORLD, STATE, data, 4)
+    assert len(pieces) == 4 and pieces[0].state is STATE
+    assert_allclose([p.start for p in pieces], [0.0, 0.5, 1.0, 1.5])
+    for piece in pieces[1:]:
+        assert_allclose(piece.state.x[0], (piece.start, 2 - piece.start), atol=1e-9)
+        assert_allclose(piece.state.v[0], (1.0, -1.0), atol=1e-9)
+        assert_allclose(piece.state.w[0], 4.0, atol=1e-9)
+        assert_allclose(piece.observations["cue.x"][0][[0, -1]], (piece.start, piece.start + 0.5))
+
+
+def test_a_clock_that_jitters_takes_one_step_for_each_frame():
+    """Times to a tenth of a millisecond, and in single precision."""
+    t = np.round(np.arange(60) / 60 * 1.0003, 4)
+    data = {"t": t, "cue.x": np.zeros((60, 2))}
+    problem = sysid.make_problem(WORLD, STATE, data, free={"cue.v": dr.real()})
+    assert problem.groups[0].data.lengths.shape[0] == 59
+    single = (np.arange(36, dtype=np.float32) / np.float32(30)).astype(float)
+    assert (steps_in(np.diff(single), 1 / 30) == 1).all() and steps_in(np.array([35 / 30]), np.float32(1 / 30)) == 35
