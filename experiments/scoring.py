@@ -73,11 +73,11 @@ def angle_between(q, other):
     return 2 * np.degrees(np.arccos(np.clip(np.abs((q * other).sum(-1)), 0, 1)))
 
 
-def arguments(title, data, train=100, test=104):
+def arguments(title, data, test=104):
     """Of the command line: the file, and how many of its records are fitted, and how many then scored."""
     parser = argparse.ArgumentParser(description=title)
     parser.add_argument("--data", type=Path, default=data)
-    parser.add_argument("--train", type=int, default=train)
+    parser.add_argument("--train", type=int, default=100)
     parser.add_argument("--test", type=int, default=test)
     return parser.parse_args()
 

@@ -84,9 +84,8 @@ def html_table(rows: Sequence[Row], header: Row = HEADER) -> str:
 
 
 def chart(
-    title: str, x_label: str, y_label: str, series: Sequence[Curve], width: int = WIDTH,
-    events: Sequence[float] = (), margin: float = 0.0,
-) -> str:  # fmt: skip
+    title: str, x_label: str, y_label: str, series: Sequence[Curve], events: Sequence[float] = (), margin: float = 0.0
+) -> str:
     """Draw a chart as SVG: axes with ticks, lines and points, a legend above.
 
     Args:
@@ -95,14 +94,14 @@ def chart(
     """
     x_range = _range([s.x[np.isfinite(s.y)] for s in series], margin)
     y_range = _range([s.y for s in series], 0.06)
-    right, bottom = width - RIGHT, HEIGHT - BOTTOM
+    right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
 
     def place(x, y):
         across = LEFT + (right - LEFT) * (x - x_range[0]) / (x_range[1] - x_range[0])
         return across, bottom - (bottom - TOP) * (y - y_range[0]) / (y_range[1] - y_range[0])
 
     parts = [
-        f'<svg class="chart" viewBox="0 0 {width} {HEIGHT}" role="img" aria-label="{html.escape(title)}">',
+        f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">',
         _text("title", LEFT, 14, title, "start"),
         *_axes(place, x_range, y_range, (right, bottom)),
         _text("label", (LEFT + right) / 2, HEIGHT - 6, x_label, "middle"),
