@@ -147,7 +147,8 @@ def misfit():
         step = jax.checkpoint(lambda state, _: (dr.step(here, state, DT), state))
         path = jax.lax.scan(step, start, None, length=FRAMES)[1]
         turned = jax.vmap(so3.difference, (0, 0))(toss["q"], path.q[:, 0])
-        angle = 2 * jnp.arctan2(*_about_y(jax.vmap(so3.difference)(path.q[:, 0], path.q[:, 1])))
+        bent = jax.vmap(so3.difference)(path.q[:, 0], path.q[:, 1])
+        angle = 2 * jnp.arctan2(bent[:, 2], bent[:, 0])
         gone = jnp.angle(jnp.exp(1j * (angle - toss["angle"])))
         parts = [path.x[:, 0] - toss["x"], jax.vmap(so3.log)(turned), gone[:, None]]
         return (jnp.concatenate(parts, 1) / NOISE.astype(np.float32) * toss["seen"][:, None]).ravel()
@@ -156,10 +157,6 @@ def misfit():
         return residuals(z, toss), jax.jacfwd(residuals)(z, toss)
 
     return jax.jit(jax.vmap(both))
-
-
-def _about_y(q):
-    return q[:, 2], q[:, 0]
 
 
 def fit_flight(record: dict, guess: dict, tensor: np.ndarray, train: int):

@@ -85,7 +85,8 @@ def make_groups(found: Sequence[Run], slots: Sequence[Slot], shared: int, longes
 def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], priors, longest: float) -> Group:
     dtype = found[0].state.x.dtype
     scenes = [Scene(run.world, run.state, run.channels) for run in found]
-    here = tuple(slot if all(knows(scenes[0], p) for p in slot.paths) else _absent(slot) for slot in slots)
+    absent = [not all(knows(scenes[0], path) for path in slot.paths) for slot in slots]  # their z does nothing here
+    here = tuple(replace(s, paths=(), prior=None) if off else s for s, off in zip(slots, absent, strict=True))
     freed = {path for slot in here for path in slot.paths}
     clocked = tuple(
         name
@@ -114,11 +115,6 @@ def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], pr
     )
     data = jax.tree.map(lambda a: a.astype(dtype if np.issubdtype(a.dtype, np.floating) else np.int32), data)
     return Group(Plan(here, clocked, priors), jax.device_put(data), members)
-
-
-def _absent(slot: Slot) -> Slot:
-    """Placeholder of a parameter in z, for scenes that do not have it."""
-    return Slot(slot.name, (), slot.kind, slot.size)
 
 
 def known(run: Run, name: str) -> np.ndarray:

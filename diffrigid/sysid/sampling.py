@@ -26,7 +26,7 @@ from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of
 from diffrigid.sysid.parameters import Slot, reference, split
 from diffrigid.sysid.problem import Data, Plan, linearised
 from diffrigid.sysid.result import Fit
-from diffrigid.sysid.setup import Problem, first_value, scene_of
+from diffrigid.sysid.setup import first_value, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import rows_of
 from diffrigid.tables import lined_up
@@ -90,7 +90,7 @@ def sample(fit: Fit, draws: int = 1000, *, chains: int = 4, warmup: int = 300, s
     first = about + random.standard_normal((chains, len(about))) @ np.linalg.cholesky(covariance).T
     parts = tuple((group.plan, group.members) for group in problem.groups)
     refer = [first_value(problem, slot) for slot in problem.shared]
-    refer_own = [_of_records(problem, slot) for slot in problem.own]
+    refer_own = [jnp.stack([reference(slot, scene_of(run)) for run in problem.runs]) for slot in problem.own]
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as blackjax relies on
         z, divergent = _chains(
             nuts, parts, problem.shared, problem.own, fit.loss, (int(warmup), int(draws)),
@@ -110,11 +110,6 @@ def _nuts() -> Any:
     except ImportError:
         raise ImportError('sample needs blackjax: pip install "diffrigid[sampling]"') from None
     return nuts
-
-
-def _of_records(problem: Problem, slot: Slot) -> Array:
-    """Value of a parameter in the scene of each record, (R, ...)."""
-    return jnp.stack([reference(slot, scene_of(run)) for run in problem.runs])
 
 
 def _covariance(fit: Fit) -> np.ndarray:

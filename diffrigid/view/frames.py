@@ -169,18 +169,16 @@ def energies(world: World, state: State) -> np.ndarray:
         if isinstance(force, Gravity):
             potential -= (mass[:, None] * x @ np.asarray(force.g, float)[:, None]).sum((1, 2))
         elif isinstance(force, SpringDamper):
-            ends = [_point(x, np.asarray(state.q, float), *end) for end in _ends(force)]
+            sides = (force.a, force.anchor_a), (force.b, force.anchor_b)
+            ends = [_point(x, np.asarray(state.q, float), *side) for side in sides]
             stretch = np.linalg.norm(ends[0] - ends[1], axis=1) - float(force.length)
             potential += 0.5 * float(force.stiffness) * stretch**2
     return np.stack([kinetic, potential, kinetic + potential], axis=1)
 
 
-def _ends(spring: SpringDamper):
-    return (spring.a, np.asarray(spring.anchor_a, float)), (spring.b, np.asarray(spring.anchor_b, float))
-
-
 def _point(x, q, body, anchor):
     """World positions (T, D) of an anchor on a body, or of a world point."""
+    anchor = np.asarray(anchor, float)
     return np.broadcast_to(anchor, x[:, 0].shape) if body is None else x[:, body] + rotated(q[:, body], anchor)
 
 
