@@ -11,7 +11,8 @@ A kind of parameter is a frozen record with the verbs
     check(where, value)       raises ValueError for a start that the kind does not allow
     scale(reference)          (k,) a large change of z: the measure of how well the data determine it
 
-`each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds prior knowledge.
+`each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds prior knowledge. Kinds with a
+condition on the value, such as directions, are in `charts`.
 """
 
 from dataclasses import dataclass

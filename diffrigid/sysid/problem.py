@@ -78,11 +78,13 @@ def make_groups(found: Sequence[Run], slots: Sequence[Slot], shared: int, longes
         scene = (run.world, run.state, run.channels)
         shapes = tuple(jnp.shape(leaf) for leaf in jax.tree.leaves(scene))
         keys.setdefault((jax.tree.structure(scene), shapes), []).append(index)
-    weights = tuple(1.0 if k >= shared else float(len(found)) ** -0.5 for k in range(len(slots)))
-    return [_group([found[i] for i in members], tuple(members), slots, weights, longest) for members in keys.values()]
+    priors = tuple(1.0 if k >= shared else float(len(found)) ** -0.5 for k in range(len(slots)))
+    return [_group([found[i] for i in members], tuple(members), slots, priors, longest) for members in keys.values()]
 
 
-def _group(found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], priors, longest: float) -> Group:
+def _group(
+    found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], priors: tuple[float, ...], longest: float
+) -> Group:
     dtype = found[0].state.x.dtype
     scenes = [Scene(run.world, run.state, run.channels) for run in found]
     absent = [not all(knows(scenes[0], path) for path in slot.paths) for slot in slots]  # their z does nothing here
