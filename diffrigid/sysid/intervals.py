@@ -1,6 +1,6 @@
 """The table of a fit: each number with its interval and unit, and notes on what the data cannot determine."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -36,29 +36,48 @@ def describe(
     residuals: tuple[dict[str, np.ndarray], ...], loss: Any,
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """Parameters with intervals, and the notes under the table."""
-    places = coordinates_of(problem)
-    blind = blind_directions(linear, places)
-    quantile = float(stdtrit(uncertainty.freedom, 0.975))
-    covariance = infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared))
-    parameters = [
-        _shared_parameter(problem, slot, shared[rows], uncertainty.covariance[rows, rows], quantile, blind, rows)
-        for slot, rows in pieces(problem.shared)
-    ]
-    if problem.own:
-        blocks = [own_covariance(linear, k, uncertainty.covariance) for k in range(len(problem.runs))]
-        parameters += _own_parameters(problem, own, blocks, quantile, blind, linear.shared)
-    notes = [b.words for b in blind]
+    blind = blind_directions(linear, coordinates_of(problem))
+    parameters = tuple(_parameters(problem, shared, own, linear, uncertainty, blind))
+    return parameters, tuple(_notes(problem, linear, uncertainty, blind, residuals, loss))
+
+
+def _parameters(
+    problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
+    blind: Sequence[Blind],
+) -> Iterator[Parameter]:  # fmt: skip
+    quantile, covariance = float(stdtrit(uncertainty.freedom, 0.975)), uncertainty.covariance
+    for slot, rows in pieces(problem.shared):
+        about, unseen = first_value(problem, slot), unseen_of(blind, rows)
+        ends = interval_of(slot, shared[rows], covariance[rows, rows], about, quantile, unseen)
+        yield Parameter(slot.name, *ends, unit_of(problem, slot), _note(slot, ends[0], blind))
+    blocks = [own_covariance(linear, k, covariance) for k in range(len(problem.runs))] if problem.own else []
+    for (slot, rows), (_, of_z) in zip(pieces(problem.own), pieces(problem.own, linear.shared), strict=True):
+        unseen = unseen_of(blind, of_z)
+        triples = [
+            interval_of(slot, own[rows, k], blocks[k][rows, rows], reference(slot, scene_of(run)), quantile, unseen)
+            for k, run in enumerate(problem.runs)
+        ]
+        value, low, high = (np.stack(parts) for parts in zip(*triples, strict=True))
+        note = _note(slot, value, blind)
+        yield Parameter(slot.name, value, low, high, unit_of(problem, slot), note, len(problem.runs))
+
+
+def _notes(
+    problem: Problem, linear: Linear, uncertainty: Uncertainty, blind: Sequence[Blind],
+    residuals: tuple[dict[str, np.ndarray], ...], loss: Any,
+) -> list[str]:  # fmt: skip
+    """What the data cannot determine, and why not to believe the intervals."""
+    notes, places = [b.words for b in blind], coordinates_of(problem)[: linear.shared]
     if uncertainty.freedom < linear.shared:
         notes.append(f"{uncertainty.freedom:.0f} degrees of freedom for {linear.shared} intervals: fit more records")
-    notes += weak(covariance, places[: linear.shared])
-    notes += _together(uncertainty.covariance, places[: linear.shared], blind)
+    notes += weak(infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared)), places)
+    notes += _together(uncertainty.covariance, places, blind)
     series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]
     series = [r for r in series if np.isfinite(r).any()]
     given = all(name in run.noise for run in problem.runs for name in run.channels)
     lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
     count = sum(map(len, linear.rows))
-    notes += doubts(series, max(1.0 - lost / count, 0.05) if given else None, not isinstance(loss, Squares))
-    return tuple(parameters), tuple(notes)
+    return notes + doubts(series, max(1.0 - lost / count, 0.05) if given else None, not isinstance(loss, Squares))
 
 
 def coordinates_of(problem: Problem) -> list[Coordinate]:
@@ -69,29 +88,6 @@ def coordinates_of(problem: Problem) -> list[Coordinate]:
 def number_names(problem: Problem) -> list[str]:
     """Names of the shared numbers of z, in order."""
     return [place.name for place in coordinates_of(problem)[: problem.sizes[0]]]
-
-
-def _shared_parameter(
-    problem: Problem, slot: Slot, z: np.ndarray, covariance: np.ndarray, quantile: float, blind: Sequence[Blind],
-    rows: slice,
-) -> Parameter:  # fmt: skip
-    about = first_value(problem, slot)
-    value, low, high = interval_of(slot, z, covariance, about, quantile, unseen_of(blind, rows))
-    return Parameter(slot.name, value, low, high, unit_of(problem, slot), _note(slot, value, blind))
-
-
-def _own_parameters(
-    problem: Problem, own: np.ndarray, blocks: list[np.ndarray], quantile: float, blind: Sequence[Blind], shared: int
-):
-    for (slot, rows), (_, of_z) in zip(pieces(problem.own), pieces(problem.own, shared), strict=True):
-        unseen = unseen_of(blind, of_z)
-        triples = [
-            interval_of(slot, own[rows, k], blocks[k][rows, rows], reference(slot, scene_of(run)), quantile, unseen)
-            for k, run in enumerate(problem.runs)
-        ]
-        value, low, high = (np.stack(parts) for parts in zip(*triples, strict=True))
-        note = _note(slot, value, blind)
-        yield Parameter(slot.name, value, low, high, unit_of(problem, slot), note, len(problem.runs))
 
 
 def _note(slot: Slot, value: np.ndarray, blind: Sequence[Blind]) -> str:
