@@ -1,4 +1,4 @@
-"""What are a mass ratio, an inertia and four more numbers worth in predicting where two hinged boxes end up?
+"""How far do a mass ratio, an inertia and four more numbers help to predict where two hinged boxes end up?
 
     python experiments/elbow_toss.py [--data FILE] [--train 100] [--test 104]
 
@@ -13,8 +13,8 @@ rotation, and that of link 2 against where the measured hinge angle has it. Besi
 puts in: equal masses, 6.167e-4 kg m^2 about all axes, friction 0.3.
 
 Result (November 2026). Flights of 100 tosses: ratio 1.2 (0.61 to 2.4), inertia 1.4 (0.65 to 3.1), damping 0.0030
-(0.0014 to 0.0058) N m s/rad: the flights tell that the hinge rubs, little of the masses. Open loop on the other 104,
-from the velocities of the first two frames instead of fitted starts:
+(0.0014 to 0.0058) N m s/rad: the flights show that the hinge rubs, and little about the masses. Open loop on the other
+104, from the velocities of the first two frames instead of fitted starts:
 
     as the source has it, restitution 0            65 +- 3 %, 72 +- 3 degrees, hinge 65 +- 4 degrees
     friction and restitution 0.15                  51 +- 2 %, 69 +- 3 degrees, hinge 60 +- 4 degrees

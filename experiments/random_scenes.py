@@ -1,4 +1,4 @@
-"""Do random valid scenes stay finite, forward and in both gradients, and keep what physics keeps?
+"""Do random valid scenes stay finite, forward and in both gradients, and obey the conservation laws?
 
     python experiments/random_scenes.py                                  # 10,000 scenes, about an hour on one core
     python experiments/random_scenes.py --structure free2 --bits 32 --batches 1 --first 3    # one batch again

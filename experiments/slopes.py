@@ -1,4 +1,4 @@
-"""Are the slopes of what is thrown those of differences?
+"""Do the derivatives of thrown bodies agree with finite differences?
 
     python experiments/slopes.py [--kind NAME] [--throws 24]
 
@@ -6,9 +6,9 @@ Bodies of some kind are thrown at a floor and at each other, for a second at 1/6
 rest. Forward mode gives how their places and orientations change, at every step, along one random direction of the
 start, of masses, restitution and friction; beside it stand central differences of three sizes. At the end of a throw
 
-    right   they agree to 1e-4 of the largest slope of the throw, with the best of the three
-    kinked  else, where the differences of 1e-6 and 1e-7 do not agree with each other: the paths that they compare part
-    wrong   else
+    right   the derivatives agree with the best of the three, to 1e-4 of the largest one of the throw
+    kinked  they do not, but neither do the differences of 1e-6 and 1e-7: the paths that these compare part
+    wrong   they do not
 
 Each kind takes about a minute on one core, most of it to compile.
 """

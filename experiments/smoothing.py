@@ -1,4 +1,4 @@
-"""What does the smooth distance do, and does annealing it find an impact that was missed?
+"""What does the smooth distance do, and does annealing its width find an impact that was missed?
 
     python experiments/smoothing.py
 

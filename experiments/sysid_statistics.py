@@ -1,12 +1,12 @@
-"""Are the intervals of a fit what they say, and is the fit as good as any can be?
+"""Do 95 % intervals contain the truth as often as they say, and is the fit as good as any can be?
 
     python experiments/sysid_statistics.py [--records 500] [--out FILE]
 
 For three scenes, many records are simulated with normal noise and a tenth of the numbers missing, and each is fitted on
-its own, from a start beside the truth, the noise estimated too. By parameter: the variance of the fitted values over
+its own, from a start near the truth, the noise estimated too. By parameter: the variance of the fitted values over
 the Cramer-Rao bound at the truth, and how often the 95 % interval holds the truth. Then the same with a drag in the
-records that the fit does not know: how often the intervals hold the truth, and how often the table says not to believe
-them.
+records that the fit does not know of: how often the intervals hold the truth, and how often the table says not to
+believe them.
 
 Result (November 2026, 500 records, four minutes): variance over the bound (of the whole covariance) 0.99, 1.04 and
 0.96; coverage 94.7, 93.8 and 95.3 % in the mean over the numbers of a scene, 93.4 to 97.2 % of each; of the three
