@@ -137,14 +137,12 @@ def unit_of(problem: Problem, slot: Slot) -> str:
     return "s" if field == "clock" else unit(scene.world, path)
 
 
-def _together(covariance: np.ndarray, places, blind) -> list[str]:
+def _together(covariance: np.ndarray, places: Sequence[Coordinate], blind: Sequence[Blind]) -> list[str]:
     """Notes on pairs of shared numbers whose errors are correlated, except those not determined at all."""
     rho, out = correlations(covariance), []
     bad = {name for b in blind for name in b.names}
-    for i, first in enumerate(places):
-        for j in range(i):
-            if abs(rho[i, j]) > CLOSE and first.path not in bad and places[j].path not in bad:
-                out.append(
-                    (abs(rho[i, j]), f"{places[j].name} and {first.name} go together (correlation {rho[i, j]:.3f})")
-                )
+    for k, two in enumerate(places):
+        for j, one in enumerate(places[:k]):
+            if abs(r := rho[k, j]) > CLOSE and not {one.path, two.path} & bad:
+                out.append((abs(r), f"{one.name} and {two.name} go together (correlation {r:.3f})"))
     return [text for _, text in sorted(out, reverse=True)[:3]]
