@@ -138,16 +138,12 @@ def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
 
 def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate]) -> list[str]:
     """Notes on shared parameters that the data barely determine."""
-    deviation = np.sqrt(np.diag(covariance))
-    hidden = [(c, s) for c, s in zip(coordinates, deviation, strict=True) if LARGE * c.scale < s < np.inf]
-
-    def text(c: Coordinate, s: float) -> str:
-        if not c.logarithmic:
-            return f"+- {s:.2g}"
-        return f"a factor {np.exp(s):.2g}" if s < ANY else "any factor"
-
-    known = [text(c, s) for c, s in hidden]
-    return [f"{c.name} is hardly seen: known to {words}" for (c, _), words in zip(hidden, known, strict=True)]
+    notes = []
+    for c, s in zip(coordinates, np.sqrt(np.diag(covariance)), strict=True):
+        if LARGE * c.scale < s < np.inf:
+            factor = f"a factor {np.exp(s):.2g}" if s < ANY else "any factor"
+            notes.append(f"{c.name} is hardly seen: known to {factor if c.logarithmic else f'+- {s:.2g}'}")
+    return notes
 
 
 def correlations(covariance: np.ndarray) -> np.ndarray:

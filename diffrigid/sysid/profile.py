@@ -116,10 +116,6 @@ def _extended(
     return z[np.isfinite(rise)], rise[np.isfinite(rise)]
 
 
-def _rises(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
-    return np.maximum(_costs(fit, index, z) - fit.costs[0], 0.0)
-
-
 def _kind_and_index(fit: Fit, name: str) -> tuple[Free, int]:
     """Kind of a shared number, and its place in z."""
     for slot, rows in pieces(fit.problem.shared):
@@ -130,8 +126,8 @@ def _kind_and_index(fit: Fit, name: str) -> tuple[Free, int]:
     raise ValueError(f"profile: no shared parameter {name!r}; there are {[slot.name for slot in fit.problem.shared]}")
 
 
-def _costs(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
-    """Lowest cost for each held value, as many at once as the fit had starts, so that nothing is recompiled."""
+def _rises(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
+    """Rise of the cost for each held value, as many at once as the fit had starts, so that nothing is recompiled."""
     count = fit.starts.shape[1]
     reach, out = reach_of(fit.problem, [index]), []
     for first in range(0, len(z), count):
@@ -142,7 +138,7 @@ def _costs(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
         start = Numbers(*(jnp.asarray(part, fit.problem.dtype) for part in (shared, own)))
         point, _ = levenberg(fit.problem.groups, start, fit.loss, 30, reach)
         out.append(np.asarray(cost_of(fit.loss, point.residuals), float))
-    return np.concatenate(out)[: len(z)]
+    return np.maximum(np.concatenate(out)[: len(z)] - fit.costs[0], 0.0)
 
 
 def _crossing(away: np.ndarray, rise: np.ndarray, level: float, side: int) -> float:

@@ -66,17 +66,16 @@ def _torn(scene: Scene) -> list[str]:
     if not world.joints:
         return []
     errors = np.asarray(joint_errors(rotations(world.dim), placed(world.joints, world.statics, state.x, state.q)))
-    joints = [
-        (name, "".join(f"{name}.{field}" for field in fields_of(joint)[:1] if moving_side(world, name)[1]))
-        for names, joint in zip(world.joint_names, world.joints, strict=True)
-        for name in names
-    ]
-    return [
-        f"the fitted start is {size:.2g} m (or rad) off the joint {name}, onto which bodies are moved before all else: "
-        "free what moves with it too, a position with an angle, anchor_b with anchor_a" + (f", or {own}" if own else "")
-        for (name, own), size in zip(joints, np.abs(errors).max(1), strict=True)
-        if size > TORN
-    ]
+    joints = [(name, joint) for names, joint in zip(world.joint_names, world.joints, strict=True) for name in names]
+    out = []
+    for (name, joint), size in zip(joints, np.abs(errors).max(1), strict=True):
+        if size > TORN:
+            own = [f", or {name}.{field}" for field in fields_of(joint)[:1] if moving_side(world, name)[1]]
+            out.append(
+                f"the fitted start is {size:.2g} m (or rad) off the joint {name}, onto which bodies are moved before "
+                "all else: free what moves with it too, a position with an angle, anchor_b with anchor_a" + "".join(own)
+            )
+    return out
 
 
 def _light_inertia(problem: Problem, scene: Scene) -> list[str]:

@@ -25,7 +25,7 @@ def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
     world, ax = checked(trajectory).world, _axes(ax)
     if world.dim != 2:
         raise ValueError("strobe draws 2D motions: for 3D use play, or plot components of state.x")
-    x, q, shapes = *_poses(trajectory), _outlines(world)
+    (x, q), shapes = _poses(trajectory), _outlines(world)
     rows = np.unique(np.rint(np.linspace(0, len(x) - 1, pictures)).astype(int))
     for owner, lines in shapes:
         for n in rows if owner < len(world.names) else ():
@@ -47,7 +47,7 @@ def film(trajectory: Trajectory, path: str | Path, speed: float = 1.0, rate: int
     kinds: dict[str, Any] = {".gif": animation.PillowWriter, ".mp4": animation.FFMpegWriter}
     if path.suffix not in kinds or not kinds[path.suffix].isAvailable():
         raise ValueError(f"film: cannot write {path.name!r}: use .gif, which needs pillow, or .mp4, which needs ffmpeg")
-    x, q, shapes, t = *_poses(trajectory), _outlines(world), np.asarray(trajectory.t, float)
+    (x, q), shapes, t = _poses(trajectory), _outlines(world), np.asarray(trajectory.t, float)
     _stage(ax, world, x, shapes)
     moving = [(owner, lines) for owner, lines in shapes if owner < len(world.names)]
     curves = [ax.plot([], [], color=f"C{owner}")[0] for owner, _ in moving]
