@@ -152,3 +152,18 @@ def test_any_leaf_may_be_batched_where_joints_and_contacts_meet():
     one = dr.rollout(world, dr.replace(state, v=v[2]), dt=1 / 60, steps=20).state
     jax.tree.map(lambda a, b: assert_allclose(a[2], b[-1], rtol=1e-10, atol=1e-12), ends, one)
     assert abs(one.v[-1, 1, 0] - 2.0) > 0.1 and abs(one.w[10, 0, 0] - one.w[2, 0, 0]) > 1e-3
+
+
+def test_a_box_of_many_worlds_comes_down_on_one_that_all_share():
+    bodies = {
+        "box": dr.Body(dr.Box(half=(0.2, 0.1)), mass=1.0, x=(0.0, 1.0)),
+        "block": dr.Static(dr.Box(half=(0.5, 0.5))),
+    }
+    world, state = dr.scene(bodies, gravity=(0.0, -9.81), restitution=0.5)
+    heights = jnp.array([0.8, 0.9, 1.1])
+    states = dr.replace(state, x=jnp.stack([state.x.at[0, 1].set(y) for y in heights]))
+    got = dr.rollout_batch(world, states, dt=1 / 30, steps=9, final_only=True)
+    fall = np.sqrt(2 * (np.asarray(heights) - 0.6) / 9.81)
+    left = np.maximum(0.3 - fall, 0.0)
+    bounced = 0.6 + 0.5 * fall * 9.81 * left - 0.5 * 9.81 * left**2
+    assert_allclose(got.x[:, 0, 1], np.where(left > 0, bounced, heights - 0.5 * 9.81 * 0.3**2), atol=1e-9)

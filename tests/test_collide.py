@@ -132,3 +132,14 @@ def test_an_edge_that_comes_down_beside_a_corner_that_has_sunk_in_is_seen(height
     there = (np.linalg.norm(point - (*crosses, 0.0), axis=1) < 1e-3) & (normal[:, 2] > 0.99) & (gap < 1e-3)
     assert there.sum() == 1
     assert_allclose(gap[there], height, atol=1e-9)
+
+
+@pytest.mark.parametrize(("dim", "kind_a", "kind_b"), PAIRS, ids=lambda p: getattr(p, "__name__", f"{p}D"))
+def test_a_body_of_many_worlds_meets_one_that_all_share(dim, kind_a, kind_b):
+    """The one has a batch axis, the other an axis of length 1."""
+    a, b = (jax.tree.map(lambda leaf: leaf[..., None], shape_of(dim, kind)) for kind in (kind_a, kind_b))
+    x, q = jnp.zeros((dim, 1)), jnp.eye(2 if dim == 2 else 4)[0][:, None]
+    many = jnp.zeros((dim, 5))
+    for x_a, x_b in ((many, x), (x, many)):
+        contacts = jax.eval_shape(COLLIDERS[kind_a, kind_b], a, x_a, q, b, x_b, q)
+        assert contacts.gap.shape[1:] == (5,)

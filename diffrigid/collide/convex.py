@@ -59,7 +59,8 @@ def _corners_against(corners: Array, rounding: Array, b, x_b: Array, q_b: Array,
 
     def one(p):
         inward = lax.stop_gradient(middle - p)
-        p_in_b, inward_in_b = jax.vmap(so.unrotate, in_axes=(None, 0))(q_b, jnp.stack([p - x_b, inward]))
+        both = jnp.stack(jnp.broadcast_arrays(p - x_b, inward))
+        p_in_b, inward_in_b = jax.vmap(so.unrotate, in_axes=(None, 0))(q_b, both)
         distance, n = core_distance(b, p_in_b, inward_in_b, slack)
         gap, normal = distance - rounding - radius(b), so.rotate(q_b, n)
         return Contacts(gap=gap, normal=normal, point=p - (rounding + 0.5 * gap)[None] * normal)
