@@ -224,6 +224,27 @@ LINE = np.array([(0.0, 0.5), (0.5, 0.5), (1.0, 0.1), (1.5, 0.0), (2.0, 0.4), (2.
 
 
 @pytest.mark.slow
+def test_a_capsule_that_slips_over_seams_slips_as_on_a_half_space():
+    """Obliquely to its axis, a step, wherever the edges of the grid are below it."""
+    capsule = dr.Body(
+        dr.Capsule(radius=0.1, half_length=0.25), mass=1.3, x=(0.0, 0.0, 0.1), q=(np.cos(0.35), 0.0, 0.0, np.sin(0.35)),
+        v=(1.0, 0.0, 0.0),
+    )  # fmt: skip
+    shifts = jnp.linspace(0.0, 0.4, 32, endpoint=False)
+
+    def after(ground, shift):
+        placed = dr.Static(ground, x=vector(shift - 4.0, 0.11 - 4.0, 0.0))
+        world, state = dr.scene({"capsule": capsule, "ground": placed}, gravity=(0.0, 0.0, -G), friction=0.3)
+        return dr.step(world, state, 1 / 60)
+
+    grid = dr.HeightField(heights=np.zeros((21, 21)), spacing=0.4)
+    got = jax.jit(jax.vmap(functools.partial(after, grid)))(shifts)
+    expected = jax.jit(functools.partial(after, dr.HalfSpace(normal=(0.0, 0.0, 1.0))))(shifts[0])
+    assert float(jnp.abs(expected.w).max()) > 0.1  # it begins to roll
+    jax.tree.map(lambda a, b: assert_allclose(a, jnp.broadcast_to(b, a.shape), atol=1e-6), got, expected)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [dr.Sphere, dr.Box])
 def test_a_profile_drawn_out_is_its_twin_in_the_plane(kind):
     """A ball, or a box that is wide across, that bounces, slides and turns over the same ground."""

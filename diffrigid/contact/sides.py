@@ -123,7 +123,12 @@ def began(a: Side, b: Side) -> Array:
 
 
 def have_faces(a: type, b: type) -> bool:
-    """Whether flat faces of shapes of two kinds may meet that end somewhere; that of a half-space does not."""
+    """Whether flat faces of shapes of two kinds may meet that end somewhere; that of a half-space does not.
+
+    A capsule has none, but its ends go from one face of a grid to the next.
+    """
+    if b is HeightField:
+        return a is not Sphere
     return b is not HalfSpace and not {a, b} & {Disc, Sphere, Capsule}
 
 
