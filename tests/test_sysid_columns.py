@@ -1,5 +1,11 @@
 """What columns observe and records hold, and what is refused of them and of the arguments of a fit."""
 
+import dataclasses
+import re
+import textwrap
+from pathlib import Path
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +16,7 @@ import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.step import steps_in
 from diffrigid.sysid.columns import columns, read_csv
+from diffrigid.sysid.parameters import channel_paths
 from diffrigid.sysid.sensors import channel_of, difference, predict
 
 WORLD, STATE = dr.scene(
@@ -62,9 +69,79 @@ def test_angles_are_compared_up_to_full_turns():
     assert_allclose(difference(channel, WORLD, states, measured), [[0.1]], atol=1e-12)
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """Pixels of a point of the plane in a camera that is turned."""
+
+    scale: float  # [pixel/m]
+    angle: float  # [rad]
+    origin: tuple = (0.0, 0.0)  # [pixel]
+    of: Any = "cue"
+
+    def __call__(self, state):
+        x, y = self.of(state)
+        c, s = self.scale * jnp.cos(self.angle), self.scale * jnp.sin(self.angle)
+        return self.origin + jnp.stack([c * x + s * y, s * x - c * y])
+
+
+@dataclasses.dataclass(frozen=True)
+class Unregistered(Camera):
+    pass
+
+
+def test_a_record_of_the_user_reads_and_has_its_numbers_as_parameters():
+    camera = Camera(scale=100, angle=0.2, origin=(320.0, 240.0), of=dr.Marker("cue"))
+    c, s = np.cos(0.2), np.sin(0.2)
+    pixels = (320 + 100 * (c + 2 * s), 240 + 100 * (s - 2 * c))
+    assert_allclose(reading(camera), pixels)
+    assert_allclose(reading(dr.Channel(Camera(scale=100, angle=0.2), bias=(320.0, 240.0))), pixels)
+    columns = channel_paths({"px": channel_of("px", camera, WORLD)})
+    assert {"px.scale", "px.angle", "px.origin", "px.of.point"} <= set(columns)
+
+
+def test_the_camera_of_the_guide_is_fitted():
+    """To a body that glides; pixels have a noise of 0.3."""
+    guide = (Path(__file__).parent.parent / "notebooks" / "guide.md").read_text()
+    (code,) = re.findall(r"^    @jax.*?\n\n(?=\S)", guide, re.M | re.S)
+    exec(textwrap.dedent(code), names := {"jax": jax, "jnp": jnp, "dataclasses": dataclasses})
+    t, c, s = np.arange(40) / 40, 100.0 * np.cos(0.2), 100.0 * np.sin(0.2)
+    x, y = 1.0 + 3.0 * t, 2.0
+    pixels = np.stack([320.0 + c * x + s * y, 240.0 + s * x - c * y], 1)
+    data = {"t": t, "px": pixels + 0.3 * np.random.default_rng(0).normal(size=(40, 2))}
+    free = {"px.scale": dr.positive(), "px.angle": dr.real(), "px.origin": dr.real()}
+    guess = names["Camera"](scale=80, angle=0, origin=(300.0, 250.0))
+    found = dr.fit(WORLD, STATE, data, free=free, observe={"px": guess}, progress=False)
+    for name, truth in (("px.scale", 100.0), ("px.angle", 0.2), ("px.origin", (320.0, 240.0))):
+        # Four standard deviations, for four numbers.
+        assert (np.abs(found[name].value - truth) < 2 * (found[name].high - found[name].value)).all(), name
+
+
+def test_a_class_that_was_edited_is_another():
+    """JAX alone takes equal records of classes of one name for one another, and may run the older program."""
+    structures = set()
+    for gain in (1.0, 2.0, 3.0):
+
+        @jax.tree_util.register_dataclass
+        @dataclasses.dataclass(frozen=True)
+        class Gauge:
+            zero: float
+
+            def __call__(self, state, gain=gain):
+                return gain * state.x[0, 1] - self.zero
+
+        assert_allclose(reading(Gauge(0.5)), (2.0 * gain - 0.5,))
+        structures.add(jax.tree.structure(channel_of("c", Gauge(0.5), WORLD)))
+    assert len(structures) == 3
+
+
 @pytest.mark.parametrize(
     ("what", "message"),
     [
+        (Unregistered(100.0, 0.2), "write @jax.tree_util.register_dataclass"),
+        (Camera, "expected 'ball.x'"),
+        (Camera(100.0, None, of=3.0), "fails for a state"),
+        (Camera(100.0, "cue.z"), "did you mean"),
         ("cue.z", "did you mean"),
         (dr.Marker("coe"), "did you mean 'cue'"),
         (3.0, "expected 'ball.x', Marker"),

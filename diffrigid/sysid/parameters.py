@@ -14,11 +14,11 @@ import numpy as np
 from jax import Array
 
 from diffrigid import paths
-from diffrigid.pytree import array_fields, replace
+from diffrigid.pytree import replace
 from diffrigid.state import State
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.free import Each, Free, Prior
-from diffrigid.sysid.sensors import Channel, is_turn
+from diffrigid.sysid.sensors import Channel, is_record, is_turn, parts_of
 from diffrigid.world import World
 
 
@@ -84,10 +84,9 @@ def channel_paths(channels: dict[str, Channel]) -> dict[str, list[tuple[str, ...
 
 def _leaves(observer: Any) -> list[tuple[str, ...]]:
     """Chains of attributes to the float leaves of an observer, and of those that it is made of."""
-    chains: list[tuple[str, ...]] = [(field,) for field in array_fields(observer)]
-    for key in ("of", "a", "b"):
-        if hasattr(observer, key):
-            chains += [(key, *chain) for chain in _leaves(getattr(observer, key))]
+    chains: list[tuple[str, ...]] = []
+    for field, part in parts_of(observer).items():
+        chains += [(field, *chain) for chain in _leaves(part)] if is_record(part) else [(field,)]
     return chains
 
 

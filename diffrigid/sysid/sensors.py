@@ -1,7 +1,21 @@
 """What a measured column observes: a function of the state, and the errors of the instrument.
 
 An observer is a callable record `observer(state) -> (size, *batch)` for one time; its float leaves can be fitted by
-the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point". Every column has besides
+the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point". One of your own is a dataclass that
+JAX knows, whose numbers have, like those of the state, trailing batch axes:
+
+    @jax.tree_util.register_dataclass
+    @dataclasses.dataclass(frozen=True)
+    class Height:
+        floor: float                              # free={"h.floor": dr.real()}
+        body: int = dataclasses.field(metadata={"static": True})  # the index of a body; its name is replaced by it
+
+        def __call__(self, state):
+            return state.x[self.body, 1] - self.floor
+
+    observe={"h": Height(floor=0.1, body="ball")}
+
+Every column has besides
 
     COLUMN.bias     (size,)  what it reads where it should read 0, in its unit
     COLUMN.scale    [-]      what it reads per unit
@@ -9,7 +23,7 @@ the path COLUMN.field: the `point` of a Marker in the column "tip" is "tip.point
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -22,7 +36,7 @@ from diffrigid import joint_motion, so3
 from diffrigid.convert import nearest, numbers, unit_quaternion
 from diffrigid.numerics import norm
 from diffrigid.paths import component
-from diffrigid.pytree import Leaf, array, map_arrays, pytree, replace, static
+from diffrigid.pytree import Leaf, array, array_fields, letters_of, pytree, replace, static
 from diffrigid.state import State, material_point, rotations
 from diffrigid.world import World, axis_sizes
 
@@ -150,8 +164,7 @@ class Function:
     fn: Callable = static()
 
     def __call__(self, state: State) -> Array:
-        value = self.fn(state)
-        return value if value.ndim > state.x.ndim - 2 else value[None]
+        return self.fn(state)
 
 
 @pytree
@@ -169,6 +182,9 @@ class Channel:
     bias: Leaf = array("M", default=0.0)  # (size, *batch) in the unit of the column
     scale: Leaf = array(default=1.0)  # (*batch) [-]
     clock: Leaf = array(default=0.0)  # (*batch) [s]
+    # Filled in: classes of the observer and its parts. JAX takes equal records of two classes for one another, such as
+    # those of a class before and after it was edited in a notebook.
+    classes: tuple[type, ...] = static(default=())
 
 
 def predict(channel: Channel, world: World, states: State) -> Array:
@@ -177,7 +193,8 @@ def predict(channel: Channel, world: World, states: State) -> Array:
 
 
 def _seen(observer: Any, world: World, state: State) -> Array:
-    return observer(state, world) if isinstance(observer, JointPart) else observer(state)
+    value = observer(state, world) if isinstance(observer, JointPart) else observer(state)
+    return value if value.ndim > state.x.ndim - 2 else value[None]
 
 
 def is_angle(channel: Channel) -> bool:
@@ -210,15 +227,38 @@ def channel_of(name: str, what: Any, world: World) -> Channel:
     """
     channel = what if isinstance(what, Channel) else Channel(observer=what)
     sizes = {"D": world.dim, "Q": 2 if world.dim == 2 else 4, "H": 3, "P": 2}
-    observer = map_arrays(partial(_fill, sizes), _resolved(name, channel.observer, world), name)
+    observer = _resolved(name, channel.observer, world, sizes)
     try:
         sizes["M"] = size_of(observer, world)
     except (TypeError, AttributeError, LookupError) as error:
         raise ValueError(f"observe[{name!r}] fails for a state of this world: {error}") from error
-    channel = map_arrays(partial(_fill, sizes), replace(channel, observer=observer), name)
+    channel = replace(channel, observer=observer, classes=tuple(_classes(observer)), **_filled(name, channel, sizes))
     if is_turn(channel) and not (np.all(channel.bias == 0) and np.all(channel.scale == 1)):
         raise ValueError(f"observe[{name!r}] has a bias or a scale, expected none for an orientation: turn the shape")
     return channel
+
+
+def _filled(name: str, record: Any, sizes: dict[str, int]) -> dict[str, Any]:
+    """Arrays for the declared leaves of a record."""
+    leaves = ((field, getattr(record, field)) for field in array_fields(record))
+    return {f: _fill(sizes, leaf, letters_of(record, f), f"{name}.{f}") for f, leaf in leaves if leaf is not None}
+
+
+def parts_of(observer: Any) -> dict[str, Any]:
+    """What an observer is made of, which may be fitted: its float leaves, and other observers, by field."""
+    found, _ = jax.tree_util.tree_flatten_with_path(observer, is_leaf=lambda node: node is not observer)
+    return {getattr(keys[0], "name", str(keys[0])): part for keys, part in found}
+
+
+def is_record(part: Any) -> bool:
+    """Whether a part of an observer is an observer, not a float leaf."""
+    return dataclasses.is_dataclass(part)
+
+
+def _classes(observer: Any) -> Iterator[type]:
+    yield type(observer)
+    for part in filter(is_record, parts_of(observer).values()):
+        yield from _classes(part)
 
 
 def _fill(sizes: dict[str, int], leaf: Any, letters: tuple[str, ...], path: str) -> Any:
@@ -241,22 +281,30 @@ def size_of(observer: Any, world: World) -> int:
     return value.shape[0]
 
 
-def _resolved(name: str, what: Any, world: World) -> Any:
-    """An observer with indices for the names of bodies."""
+def _resolved(name: str, what: Any, world: World, sizes: dict[str, int]) -> Any:
+    """An observer with indices for the names of bodies, and arrays for numbers."""
     if isinstance(what, str):
         return _by_name(name, what, world)
-    if not callable(what):
+    if not callable(what) or isinstance(what, type):
         raise ValueError(f"observe[{name!r}] is {what!r}: expected 'ball.x', Marker(body='ball'), or a function")
-    if not hasattr(what, "__dataclass_fields__"):
+    if not is_record(what):
         return Function(fn=what)
-    changes: dict[str, Any] = {}
-    target = getattr(what, "body", None)
+    if jax.tree_util.all_leaves([what]) or not set(parts := parts_of(what)) <= set(what.__dataclass_fields__):
+        raise ValueError(
+            f"observe[{name!r}] is a {type(what).__name__}, of which JAX does not know the fields: write "
+            "@jax.tree_util.register_dataclass above its @dataclass"
+        )
+    changes = _filled(name, what, sizes)
+    target = None if "body" in parts else getattr(what, "body", None)
     if isinstance(target, str):
         if target not in world.names:
             hint = nearest(target, world.names)
             raise ValueError(f"observe[{name!r}].body is {target!r}, which is not a moving body: {hint}")
         changes["body"] = world.names.index(target)
-    changes |= {k: _resolved(name, getattr(what, k), world) for k in ("of", "a", "b") if hasattr(what, k)}
+    for field, part in parts.items():
+        if field not in changes and part is not None:
+            observes = isinstance(part, str) or callable(part)
+            changes[field] = _resolved(name, part, world, sizes) if observes else numbers(f"{name}.{field}", part, None)
     return replace(what, **changes)
 
 
