@@ -36,8 +36,11 @@ class Revolute:
     """A hinge: two points stay together and, in 3D, two axes stay parallel.
 
     Anchors and axes are in body axes, from the centre of mass; for `b=None`, the world, anchor_b is a world
-    point. What is not given of b is taken from the initial poses of the bodies, where, in 3D or with limits, the angle
-    is 0; else it is the difference of the angles of both.
+    point. What is not given of b is taken from the initial poses of the bodies.
+
+    The angle is that of a relative to b, counter-clockwise in 2D and right-handed about the axis in 3D. For angles as a
+    robot has them, the child comes first: `Revolute("forearm", "arm")`. In 3D or with limits it is 0 in the initial
+    poses; else it is the angle of a less that of b.
 
     Example:
         >>> door = dr.Body(None, mass=9.0, inertia=0.6, x=(0.4, 0.0))
@@ -132,6 +135,9 @@ class Weld:
 @pytree
 class Prismatic:
     """A slider: anchor_a stays on the line through anchor_b along axis_b, and a does not turn against b.
+
+    The translation is that of a relative to b: how far anchor_a is from anchor_b, positive along axis_b. For
+    translations as a robot has them, the child comes first: `Prismatic("drawer", "desk", ...)`.
 
     Example:
         >>> slider = dr.Prismatic("puck", axis_b=(1.0, 0.0), lower=-1.0, upper=1.0, speed=0.5, friction=3.0)  # a motor

@@ -108,6 +108,21 @@ def test_turned_pendulum_is_where_trigonometry_has_it():
     assert_allclose(state.w, 2.0, atol=ROUNDING)
 
 
+@pytest.mark.parametrize(
+    ("joint", "path", "value"),
+    [
+        (dr.Revolute("hand", "arm", anchor_a=(0.0, 0.0)), "j.angle", 0.7),
+        (dr.Revolute("hand", "arm", anchor_a=(0.0, 0.0)), "j.rate", -1.0),
+        (dr.Revolute("arm", "hand", anchor_a=(0.5 * np.cos(0.3), -0.5 * np.sin(0.3))), "j.angle", -0.7),
+        (dr.Prismatic("hand", axis_b=(1.0, 0.0), anchor_b=(0.2, 0.0)), "j.translation", 0.3),
+    ],
+)
+def test_a_coordinate_is_that_of_the_first_body_relative_to_the_second(joint, path, value):
+    arm = dr.Body(DISC, mass=1.0, x=(0.0, 0.0), angle=0.3, v=(0.0, -0.5), w=1.0)
+    hand = dr.Body(DISC, mass=1.0, x=(0.5, 0.0), angle=1.0)
+    assert_allclose(read(*dr.scene({"arm": arm, "hand": hand}, joints={"j": joint}), path), value, atol=ROUNDING)
+
+
 def test_a_joint_that_came_apart_is_closed():
     """A pendulum made longer: its bob follows, and so does its velocity."""
     world, state = double_pendulum()

@@ -151,6 +151,21 @@ def test_three_links_swing_as_in_mujoco(write):
     assert_allclose(end.x, data.xipos[bodies], atol=FOLLOWS)
 
 
+def test_angles_and_translations_count_as_those_of_mujoco(write):
+    mujoco = pytest.importorskip("mujoco")
+    path = write(LINKS.replace('<joint axis="0 0 1"/>', '<joint type="slide" axis="0 0 1"/>'))
+    with pytest.warns(UserWarning, match="timestep of option; integrator of option"):
+        world, state = dr.load_mjcf(path)
+    values = {"a_joint.angle": 0.4, "b_joint.angle": -0.7, "c_joint.translation": 0.1}
+    for name, value in values.items():
+        world, state = dr.paths.write(world, state, name, value)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qpos[:] = list(values.values())
+    mujoco.mj_forward(model, data)
+    assert_allclose(state.x, data.xipos[[model.body(name).id for name in world.names]], atol=SAME)
+
+
 def test_a_urdf_is_that_of_mujoco(write):
     mujoco = pytest.importorskip("mujoco")
     path = write(ROBOT)
