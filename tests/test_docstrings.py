@@ -2,6 +2,7 @@
 
 import doctest
 import importlib.util
+import inspect
 import re
 from pathlib import Path
 
@@ -24,11 +25,13 @@ EXTRAS = {"sample": "blackjax"}  # what an example needs beside the package; whe
 
 
 def examples():
-    """Of every name on the page that has one."""
+    """Of every name on the page that has one, with those of its methods."""
     parser = doctest.DocTestParser()
     for name in NAMES:
         public = next(getattr(where, name) for where in (dr, dr.sysid, dr.paths) if hasattr(where, name))
-        example = parser.get_doctest(public.__doc__, {}, name, None, 0)
+        members = [part for key, part in vars(public).items() if inspect.isfunction(part) and key[0] != "_"]
+        text = "\n\n".join(inspect.getdoc(part) or "" for part in (public, *members))
+        example = parser.get_doctest(text, {}, name, None, 0)
         if example.examples:
             yield example
 

@@ -93,6 +93,33 @@ def test_noise_and_intervals_are_those_of_linear_regression(fit, exact):
     assert_allclose(half, stdtrit(freedom, 0.975) * np.sqrt(np.diag(covariance)[:2]), rtol=1e-6)
 
 
+def test_a_derived_number_has_the_interval_of_the_delta_method(fit, exact):
+    """When the point of a record would turn round, -v / g, of a number of its own and a shared one."""
+    matrix, right, _, best = exact
+    freedom = len(right) - matrix.shape[1]
+    covariance = ((right - matrix @ best) ** 2).sum() / freedom * np.linalg.inv(matrix.T @ matrix)
+    for k in (0, RECORDS - 1):
+        turn = fit.derived(lambda world, state: -state.v[0, 1] / dr.paths.read(world, state, "gravity")[1], record=k)
+        at = [1, 5 + 4 * k]  # g and v in the algebra
+        g, v = best[at]
+        slope = np.array([v / g**2, -1.0 / g])
+        half = stdtrit(freedom, 0.975) * np.sqrt(slope @ covariance[np.ix_(at, at)] @ slope)
+        assert_allclose(turn.value, -v / g, rtol=1e-6)
+        assert_allclose([turn.value - turn.low, turn.high - turn.value], half, rtol=1e-5)
+
+
+@pytest.mark.parametrize("intervals", [sysid.from_jacobian, dr.sandwich])
+def test_a_parameter_that_is_derived_has_its_own_interval(fit, intervals):
+    fit = fit.with_intervals(intervals)
+    gravity = fit.derived(lambda world, state: dr.paths.read(world, state, "gravity"))
+    position = fit.derived(lambda world, state: state.x[0], record=2)
+    for end in ("value", "low", "high"):
+        assert_allclose(getattr(gravity, end), getattr(fit["gravity"], end), rtol=1e-12)
+        assert_allclose(getattr(position, end), getattr(fit["p.x"], end)[2], rtol=1e-12)
+    with pytest.raises(ValueError, match="record is 6: expected 0 to 5"):
+        fit.derived(lambda world, state: state.x[0], record=RECORDS)
+
+
 def test_what_lies_beyond_the_last_window_is_left_out(records, fit):
     """The fit of the first half a second of each record is that of records which end there."""
     early = [dr.Record({k: v[r.observations["t"] <= r.observations["t"][0] + 0.5] for k, v in r.observations.items()},
@@ -148,6 +175,10 @@ def test_what_is_seen_only_together_has_no_interval():
     found = dr.fit(*scene(0.01), {"t": t, "ball.x": x}, free=free, progress=False)
     assert np.isinf([found[name].high for name in list(free)[:2]]).all() and np.isfinite(found["restitution"].high)
     assert any("floor.shape.offset" in note and "ball.shape.radius" in note for note in found.notes)
+    paths = list(free)[:2]
+    top = found.derived(lambda world, state: sum(dr.paths.read(world, state, path) for path in paths))
+    assert top.low < 0.05 < top.high < top.low + 0.01
+    assert np.isinf(found.derived(lambda world, state: dr.paths.read(world, state, paths[0]) ** 2).high)
 
 
 def test_what_each_record_shows_only_together_has_no_interval_in_any(records):

@@ -97,10 +97,21 @@ def bootstrap(linear: Linear) -> Uncertainty:
 
 def own_covariance(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
     """Covariance (b, b) of a record's own numbers, given that of the shared ones."""
+    return joint_covariance(linear, record, shared)[linear.shared :, linear.shared :]
+
+
+def joint_covariance(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
+    """Covariance (a + b, a + b) of the shared numbers and a record's own, given that of the shared ones.
+
+    The own numbers are those of the best fit to the shared ones, and follow them with the slope -D B^T A, where A and B
+    are the Jacobians by both and D = (B^T B)^-1; their own scatter is D.
+    """
     shared_part, own = np.split(linear.slopes[record], [linear.shared], axis=1)
     D = inverse(own.T @ own)
-    across = D @ own.T @ shared_part
-    return linear.variance * D + across @ shared @ across.T
+    follow = np.concatenate([np.eye(linear.shared), -D @ own.T @ shared_part])
+    covariance = follow @ shared @ follow.T
+    covariance[linear.shared :, linear.shared :] += linear.variance * D
+    return covariance
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:

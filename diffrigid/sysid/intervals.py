@@ -1,15 +1,17 @@
 """The table of a fit: each number with its interval and unit, and notes on what the data cannot determine."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from scipy.special import stdtrit
 
-from diffrigid.paths import component, unit
-from diffrigid.sysid.covariance import Linear, Uncertainty, own_covariance
+from diffrigid.paths import component, unit, write
+from diffrigid.state import State
+from diffrigid.sysid.covariance import Linear, Uncertainty, joint_covariance, own_covariance
 from diffrigid.sysid.diagnosis import (
     Blind,
     Coordinate,
@@ -22,10 +24,11 @@ from diffrigid.sysid.diagnosis import (
 )
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.parameters import Slot, pieces, reference
+from diffrigid.sysid.parameters import Slot, pieces, put, reference
 from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import BLIND
+from diffrigid.world import World
 
 UNSEEN = 1e-6  # [-] part of a slope along undetermined directions: more is not rounding
 CLOSE = 0.95  # [-] correlation from which on two parameters are reported to go together
@@ -118,14 +121,39 @@ def interval_of(
             value, low, high = (np.asarray(slot.kind.value(end, about), float) for end in ends)
         return value, low, high
     centre = jnp.asarray(z, jnp.result_type(about))
-    value = np.asarray(slot.kind.value(centre, about), float)
-    slope = np.asarray(jax.jacfwd(slot.kind.value)(centre, about), float)
+    return _to_first_order(lambda z: slot.kind.value(z, about), centre, covariance, quantile, unseen)
+
+
+def _to_first_order(
+    fn: Callable[[Array], Any], z: Array, covariance: np.ndarray, quantile: float, unseen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Value of fn(z), and low and high end of its interval, infinite where it changes along `unseen` (n, k)."""
+    value, slope = (np.asarray(part, float) for part in (fn(z), jax.jacfwd(fn)(z)))
     along = slope @ unseen.T
     blind = np.linalg.norm(along, axis=-1) > UNSEEN * np.linalg.norm(slope, axis=-1)
     slope = slope - along @ unseen
     half = quantile * np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", slope, covariance, slope), 0.0))
     half = np.where(blind, np.inf, half)
-    return value, value - half, value + half
+    return value, np.asarray(value - half), np.asarray(value + half)
+
+
+def derived(
+    problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
+    fn: Callable[[World, State], Any], record: int,
+) -> Parameter:  # fmt: skip
+    """What `fn` makes of the fitted scene of a record, with its interval by the delta method."""
+    group = next(group for group in problem.groups if record in group.members)
+    scene = scene_of(problem.runs[record])
+
+    def of_numbers(z: Array) -> Array:
+        fitted = put(group.plan.slots, scene, z)
+        return jnp.asarray(fn(*write(fitted.world, fitted.state, "contact.width", problem.width)))
+
+    numbers = jnp.asarray(np.concatenate([shared, own[:, record]]), problem.dtype)
+    covariance = joint_covariance(linear, record, uncertainty.covariance)
+    unseen = unseen_of(blind_directions(linear, coordinates_of(problem)), slice(0, len(numbers)))
+    ends = _to_first_order(of_numbers, numbers, covariance, float(stdtrit(uncertainty.freedom, 0.975)), unseen)
+    return Parameter(getattr(fn, "__name__", type(fn).__name__), *ends, unit="", note="")
 
 
 def unit_of(problem: Problem, slot: Slot) -> str:

@@ -1,6 +1,6 @@
 """The result of a fit, and what can be asked of it: predictions, scores, other intervals, a report."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from diffrigid.state import State
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty
 from diffrigid.sysid.diagnosis import correlations
-from diffrigid.sysid.intervals import describe
+from diffrigid.sysid.intervals import derived, describe
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene
@@ -150,6 +150,25 @@ class Fit:
             name: np.concatenate([columns[name].ravel() for columns in found if name in columns]) for name in names
         }
         return {name: float(np.sqrt(np.nanmean(residuals**2))) for name, residuals in values.items()}
+
+    def derived(self, fn: Callable[[World, State], Any], record: int = 0) -> Parameter:
+        """A number, or an array, that follows from the fitted scene of a record, with its 95 % interval.
+
+        The interval is symmetric, to first order in the errors of the fit, and by the same covariance and quantile as
+        those in the table (of `with_intervals` too). It is infinite where the data do not determine the number.
+
+        Args:
+            fn: of the world and the initial state, in operations of JAX.
+            record: whose scene it is, where records have numbers of their own.
+
+        Example:
+            >>> lost = found.derived(lambda world, state: 1.0 - dr.paths.read(world, state, "restitution") ** 2)
+            >>> bool(lost.low < 1.0 - 0.8**2 < lost.high)  # share of the energy that an impact takes
+            True
+        """
+        if record not in range(len(self.scenes)):
+            raise ValueError(f"record is {record!r}: expected 0 to {len(self.scenes) - 1}")
+        return derived(self.problem, self.shared, self.own, self.linear, self.uncertainty, fn, record)
 
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
