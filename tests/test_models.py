@@ -228,6 +228,16 @@ def test_what_is_left_out_is_named(case, write):
         dr.load_mjcf(write(text))
 
 
+@pytest.mark.parametrize(
+    ("load", "text"),
+    [(dr.load_mjcf, LEFT_OUT["margin"][0]), (dr.load_urdf, ROBOT.replace("</robot>", "<odd/></robot>"))],
+)
+def test_the_warning_is_at_the_line_that_loads(load, text, write):
+    with pytest.warns(UserWarning, match="left out") as caught:
+        load(write(text))
+    assert caught[0].filename == __file__
+
+
 def test_limits_of_a_hinge_may_lie_beyond_half_a_turn(write):
     world, state = dr.load_mjcf(
         write(mjcf('<body name="a"><joint name="j" range="-20 270"/><geom size="0.1" pos="1 0 0"/></body>'))

@@ -125,7 +125,8 @@ def assemble(
             name = free_name(link.joint.name or f"{link.name}_joint", {*bodies, *made}, "_joint")
             made[name] = _joint(link, frames, skipped)
     if skipped:
-        warnings.warn(f"{where}: left out: {'; '.join(dict.fromkeys(skipped))}.", stacklevel=3)
+        # At the call of `load_mjcf` or `load_urdf`, which `np.errstate` wraps.
+        warnings.warn(f"{where}: left out: {'; '.join(dict.fromkeys(skipped))}.", stacklevel=4)
     return scene(
         bodies, gravity=gravity, restitution=restitution, contact=contact, joints=made,
         ignore=_ignored(shapes, set(map(frozenset, apart))),
