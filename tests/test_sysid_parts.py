@@ -97,6 +97,14 @@ def test_numbers_that_were_fitted_together_have_their_own_names():
     assert_array_equal(fit["b.x"].value, [1.0, 3.0])
 
 
+def test_a_table_hides_no_single_record():
+    def names(records):
+        values = np.arange(float(records))
+        return [row[0] for row in rows_of(Parameter("a", values, values, values, "", "", records))]
+
+    assert names(3) == ["a{0}", "a{1}", "a{2}"] and names(4) == [*names(3), "a{3}"] and names(5) == [*names(3), "a"]
+
+
 def test_a_posterior_of_a_component_prints_its_table():
     parameter = Parameter("a.v[1]", *(np.asarray(end) for end in (1.0, 0.9, 1.1)), "m/s", "")
     fit = Summary((parameter,), {}, np.zeros(1), 1, (), (), 0, 1.0, {})

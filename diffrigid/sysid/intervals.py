@@ -72,7 +72,8 @@ def _notes(
     """What the data cannot determine, and why not to believe the intervals."""
     notes, places = [b.words for b in blind], coordinates_of(problem)[: linear.shared]
     if uncertainty.freedom < linear.shared:
-        notes.append(f"{uncertainty.freedom:.0f} degrees of freedom for {linear.shared} intervals: fit more records")
+        degrees = "1 degree" if round(uncertainty.freedom) == 1 else f"{uncertainty.freedom:.0f} degrees"
+        notes.append(f"{degrees} of freedom for {linear.shared} intervals: fit more records")
     notes += weak(infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared)), places)
     notes += _together(uncertainty.covariance, places, blind)
     series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]

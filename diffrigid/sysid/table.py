@@ -22,11 +22,12 @@ def rows(summary: "Summary") -> list[tuple[str, ...]]:
 
 
 def rows_of(p: Any) -> list[tuple[str, ...]]:
-    """Rows of one parameter; if each record has its own, those of the first three, {0}, {1}, ..."""
+    """Rows of one parameter; if each record has its own, those of the first three, {0}, {1}, ..., or of all four."""
     out: list[tuple[str, ...]] = []
+    shown = p.records if p.records <= SHOWN + 1 else SHOWN  # a line that hides one record saves none
     for index in np.ndindex(p.value.shape):
         record, part = (index[:1], index[1:]) if p.records else ((), index)
-        if record and record[0] >= SHOWN:
+        if record and record[0] >= shown:
             continue
         name = p.name + "".join(f"{{{k}}}" for k in record) + (f"[{', '.join(map(str, part))}]" if part else "")
         value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
@@ -34,8 +35,8 @@ def rows_of(p: Any) -> list[tuple[str, ...]]:
         interval = f"{low:.{places}g} .. {high:.{places}g}"
         note = "" if p.note == BLIND and np.isfinite(low) and np.isfinite(high) else p.note
         out.append((name, f"{value:.{places}g}", interval, p.unit or "-", note))
-    if p.records > SHOWN:
-        out.append((p.name, "...", "", "", f"and {p.records - SHOWN} more records"))
+    if p.records > shown:
+        out.append((p.name, "...", "", "", f"and {p.records - shown} more records"))
     return out
 
 
