@@ -270,13 +270,47 @@ def test_pieces_of_a_long_record_start_where_it_was_measured():
     t = np.arange(41) / 20
     data = {"t": t, "cue.x": np.stack([t, 2 - t], 1), "cue.angle": 0.5 + 4.0 * t}
     pieces = dr.segments(WORLD, STATE, data, 4)
-    assert len(pieces) == 4 and pieces[0].state is STATE
+    assert len(pieces) == 4
     assert_allclose([p.start for p in pieces], [0.0, 0.5, 1.0, 1.5])
-    for piece in pieces[1:]:
+    for piece in pieces:
         assert_allclose(piece.state.x[0], (piece.start, 2 - piece.start), atol=1e-9)
         assert_allclose(piece.state.v[0], (1.0, -1.0), atol=1e-9)
         assert_allclose(piece.state.w[0], 4.0, atol=1e-9)
         assert_allclose(piece.observations["cue.x"][0][[0, -1]], (piece.start, piece.start + 0.5))
+
+
+def states_to_begin_with(scene, records, free):
+    kinds = {name: dr.each(kind) for name, kind in free.items()}
+    return [run.state for run in sysid.make_problem(*scene, records, free=kinds).runs]
+
+
+def test_records_begin_as_their_first_rows_show():
+    """In what is free for each: a line through five rows, a hole among them; not where a record gives its state."""
+    t = np.arange(9) / 20
+    x = np.stack([5.0 + 2.0 * t, 1.0 - t], 1)
+    x[2] = np.nan
+    thrown = {"t": t, "cue.x": x, "cue.angle": np.mod(3.0 + 4.0 * t, 2 * np.pi)}
+    half = {"t": t, "cue.x[1]": x[:, 1], "ball.x": (t + 9.0, x + 1.0)}
+    free = {"cue.x": dr.real(), "cue.v[0]": dr.interval(2.5, 4.0), "cue.angle": dr.real(), "cue.w": dr.real()}
+    scene = (WORLD, STATE)
+    state, given = states_to_begin_with(scene, [thrown, dr.Record(thrown, state=STATE)], free)
+    assert_array_equal(given.x, STATE.x)
+    assert_allclose(state.x[0], (5.0, 1.0), atol=1e-9)
+    assert_allclose(state.v[0], (2.5, 0.0))  # the end of its interval; the other number is not free
+    assert_allclose(state.q[0], (np.cos(3.0), np.sin(3.0)), atol=1e-9)
+    assert_allclose(state.w[0], 4.0, atol=1e-9)
+    (state,) = states_to_begin_with(scene, half, {"cue.x": dr.real(), "ball.x": dr.real()})
+    assert_allclose(state.x, ((1.0, 1.0), (4.0, 6.0)), atol=1e-9)  # not measured; measured much later
+
+
+def test_a_tumbling_body_begins_as_its_first_rows_show():
+    t, w, first = np.arange(9) / 60, np.array([3.0, -1.0, 2.0]), np.array([0.5, -0.5, 0.5, 0.5])
+    q = np.asarray(jax.vmap(dr.so3.turn_by)(w * t[:, None], jnp.broadcast_to(first, (9, 4))))
+    q = q * np.where(np.arange(9) % 2, 1.0, -1.0)[:, None]  # the same orientations
+    free = {"die.q": dr.rotation(), "die.w": dr.real()}
+    (state,) = states_to_begin_with((SOLID, SOLID_STATE), {"t": t, "die.q": q}, free)
+    assert_allclose(abs(state.q[0] @ first), 1.0, atol=1e-9)
+    assert_allclose(state.w[0], w, atol=1e-6)
 
 
 def test_a_clock_that_jitters_takes_one_step_for_each_frame():

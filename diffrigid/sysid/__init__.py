@@ -4,7 +4,7 @@ To read it, in the order of a fit; `fit.py` runs it:
 
     what was measured     columns.py, records.py, sensors.py, times.py
     what is free          free.py, charts.py (kinds), parameters.py (where they are); losses.py
-    the problem           setup.py, problem.py (from z to residuals), clocks.py, points.py (back)
+    the problem           setup.py, first_rows.py, problem.py (from z to residuals), clocks.py, points.py (back)
     solvers               levenberg.py, gradient.py; segments.py for long records
     how sure              covariance.py, profile.py, sampling.py, diagnosis.py, remarks.py, orders.py
     what comes out        result.py, intervals.py, summary.py, table.py, figures.py

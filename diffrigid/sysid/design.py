@@ -77,7 +77,7 @@ def blind_spots(
         >>> dr.sysid.blind_spots(made, start, seen, free=both)
         ('only the ratio ball.mass / spring.stiffness is seen',)
     """
-    problem = make_problem(world, state, observations, free=free, noise=noise, observe=observe, dt=dt)
+    problem = make_problem(world, state, observations, free=free, noise=noise, observe=observe, dt=dt, begin=False)
     return tuple(blind.words for blind in blind_directions(_linear(problem), coordinates_of(problem)))
 
 

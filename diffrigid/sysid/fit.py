@@ -57,7 +57,7 @@ def fit(
             pair (t, values). The first time is that of `state`. A column with the name of a `control` of a force is
             what acts, each value until the next. A list of such, or of `Record`, is fitted together.
         free: what may vary: a path (see `diffrigid.paths` and `diffrigid.sysid.sensors`), or a tuple of paths that
-            share one value. `each(kind)` gives every record its own.
+            share one value. `each(kind)` gives every record its own, which begins as its first rows show it.
         starts: the first is at the values of `world` and `state`, the others are random.
         dt: [s] longest step; default 1.1 times the median of the intervals of t, but no more than 0.02 s where bodies
             touch, have joints, or forces vary.

@@ -22,7 +22,8 @@ class Record:
 
     Args:
         observations: as of `fit`.
-        state: its own initial state; default that of `fit`. world: likewise.
+        state: its own initial state; default that of `fit`, with what is free by `each` as the first rows show it.
+        world: its own; default that of `fit`.
         start: [s] time of the initial state; default the first time of its columns.
         noise: standard deviations of its columns, numbers or arrays like the columns; default those of `fit`.
 
@@ -51,6 +52,7 @@ class Run:
     start: float  # [s]
     noise: Mapping[str, Any]
     controls: tuple[Series, ...] = ()  # each held from one of its times to the next
+    stated: bool = False  # its initial state was given with it
 
 
 def series_of(run: Run, name: str) -> Series:
@@ -108,7 +110,7 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
                 "before?"
             )
     given = {name: sigma for name, sigma in noise.items() if name in names} | own
-    return Run(world, state, channels, series, start, given, controls)
+    return Run(world, state, channels, series, start, given, controls, record.state is not None)
 
 
 def same_data(one: Run, other: Run) -> bool:

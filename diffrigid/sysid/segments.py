@@ -18,14 +18,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from diffrigid import paths
 from diffrigid.convert import at_least_one
 from diffrigid.state import State, rotations
 from diffrigid.sysid.charts import rotation
-from diffrigid.sysid.columns import Series, columns
+from diffrigid.sysid.columns import columns
+from diffrigid.sysid.first_rows import shown, with_values
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import Each, each, real
 from diffrigid.sysid.records import SAME, Record
@@ -34,12 +34,13 @@ from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.times import motion
 from diffrigid.world import World, check
 
-FRAMES = 5  # rows of a column from which its start is guessed
 LOST = 1.5  # [-] times the noise in pieces: residuals of the whole record beyond which it is reported as lost
 
 
 def segments(world: World, state: State, observations: Any, count: int) -> list[Record]:
-    """Cut a record into pieces of equal duration, with initial states guessed from the first rows of "x" and "angle".
+    """Cut a record into pieces of equal duration, each of which begins as its first rows show it, the first one too.
+
+    Positions, angles and orientations that are measured, and their velocities; the others are those of `state`.
 
     Example:
         >>> [piece.start for piece in dr.segments(world, state, measured, 3)]
@@ -53,35 +54,14 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
     first, last = min(s.t[0] for s in series), max(s.t[-1] for s in series)
     edges = np.linspace(first, last, count + 1)
     out = []
-    for k, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for start, end in itertools.pairwise(edges):
         start = max(s.t[s.t <= start + SAME][-1] for s in series if (s.t <= start + SAME).any())
         use = {s.name: (s.t >= start - SAME) & (s.t <= end + SAME) for s in series}
         pieces = {s.name: (s.t[use[s.name]], s.values[use[s.name]]) for s in series}
         pieces |= {c.name: (c.t, c.values) for c in controls}
-        own = state
-        for s in series:
-            if k and isinstance(channels[s.name].observer, Part):
-                own = _guessed(world, own, s, start)
+        own = with_values(world, state, shown(world, series, channels, start))
         out.append(Record(pieces, state=own, start=float(start)))
     return out
-
-
-def _guessed(world: World, state: State, series: Series, start: float) -> State:
-    """Set position and velocity of one column's body in the state, by a straight line through its next rows."""
-    body, _, field = series.name.rpartition(".")
-    names = {"x": ("x", "v"), "angle": ("angle", "w")}
-    if field not in names:
-        return state
-    later = (series.t >= start - SAME) & np.isfinite(series.values).all(1)
-    t, values = series.t[later][:FRAMES] - start, series.values[later][:FRAMES]
-    if len(t) < 2:
-        return state
-    values = np.unwrap(values, axis=0) if field == "angle" else values
-    slope, value = np.polyfit(t, values, 1)
-    shape = () if field == "angle" else value.shape
-    for name, number in zip(names[field], (value.reshape(shape), slope), strict=True):
-        _, state = paths.write(world, state, f"{body}.{name}", jnp.asarray(number, state.x.dtype))
-    return state
 
 
 def fit_in_pieces(

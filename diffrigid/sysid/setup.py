@@ -20,6 +20,7 @@ from diffrigid.devices import everywhere
 from diffrigid.paths import write as write_path
 from diffrigid.state import State
 from diffrigid.step import floats
+from diffrigid.sysid.first_rows import begun
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers
 from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
@@ -74,18 +75,23 @@ def make_problem(
     dt: float | None = None,
     resume: Any = None,
     places: Sequence[int | None] | None = None,
+    begin: bool = True,
 ) -> Problem:
     """Check the arguments, which are those of `fit`, and put all records into arrays.
 
     Args:
+        begin: a record without a state of its own begins as its first rows show it, in what is free by `each`.
         places: for each record, the record of `resume` whose own numbers it takes; None: none. Default in order.
     """
     found = runs(world, state, observations, observe or {}, noise)
     pairs = [floats(run.world, run.state) for run in found]
     found = [replace(run, world=w, state=s) for run, (w, s) in zip(found, pairs, strict=True)]
-    if resume is not None:
-        found = _resumed(found, resume, free, range(len(found)) if places is None else places)
     shared, own = make_slots(free, [scene_of(run) for run in found])
+    if begin:
+        found = [run if run.stated else begun(run, own) for run in found]
+    if resume is not None:
+        found = _resumed(found, resume, (*shared, *own), range(len(found)) if places is None else places)
+        make_slots(free, [scene_of(run) for run in found])  # checks where it goes on from
     longest = longest_step(found, dt)
     lasts = max(float(series.t[-1]) - run.start for run in found for series in run.series)
     if lasts > MANY * longest:
@@ -168,9 +174,8 @@ def _noise_guesses(found: Sequence[Run]) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in guesses.items()}
 
 
-def _resumed(found: list[Run], saved: Any, free: Mapping[Any, Any], places: Sequence[int | None]) -> list[Run]:
+def _resumed(found: list[Run], saved: Any, slots: Sequence[Slot], places: Sequence[int | None]) -> list[Run]:
     """Records whose scenes hold the values of an earlier fit, for parameters that are free again."""
-    slots = [slot for group in make_slots(free, [scene_of(run) for run in found]) for slot in group]
     parameters = {p.name: p for p in saved.parameters}
     out = []
     for place, run in zip(places, found, strict=True):

@@ -1,0 +1,90 @@
+"""Where a record begins, as its first rows show it: poses, and velocities by a straight line through a few rows."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from diffrigid import paths
+from diffrigid.convert import known
+from diffrigid.state import State, rotations
+from diffrigid.sysid.columns import Series
+from diffrigid.sysid.free import Free
+from diffrigid.sysid.parameters import Slot
+from diffrigid.sysid.records import SAME, Run
+from diffrigid.sysid.sensors import Channel, JointPart, Part
+from diffrigid.world import World
+
+ROWS = 5  # rows of a column that the line is laid through
+RATES = {"x": "v", "angle": "w", "q": "w", "translation": "rate"}  # of a body, or of a slider
+
+
+def begun(run: Run, slots: Sequence[Slot]) -> Run:
+    """The record begun as its first rows show it, in those of the free parameters that they show."""
+    seen = shown(run.world, run.series, run.channels, run.start)
+    values: dict[str, np.ndarray] = {}
+    for slot in slots:
+        if isinstance(slot.kind, Free) or slot.kind.name == "rotation":
+            whole, index = paths.component(slot.paths[0])
+            if whole in seen:
+                value = seen[whole] if index is None else seen[whole][index]
+                values |= dict.fromkeys(slot.paths, np.clip(value, *_ends(slot)))
+    return replace(run, state=with_values(run.world, run.state, values)) if values else run
+
+
+def _ends(slot: Slot) -> tuple[float, float]:
+    return (slot.kind.low, slot.kind.high) if isinstance(slot.kind, Free) else (-1.0, 1.0)
+
+
+def with_values(world: World, state: State, values: Mapping[str, np.ndarray]) -> State:
+    """A state with these values by path, except where they are NaN."""
+    for path in sorted(values, key=lambda path: paths.order_of(world, path)):
+        now = np.asarray(paths.read(world, state, path))
+        value = np.reshape(values[path], now.shape).astype(now.dtype)
+        state = paths.write(world, state, path, np.where(np.isfinite(value), value, now))[1]
+    return state
+
+
+def shown(
+    world: World, series: Sequence[Series], channels: Mapping[str, Channel], start: float
+) -> dict[str, np.ndarray]:
+    """Poses and velocities at `start` [s] by path, (size,), NaN where the next rows do not show them.
+
+    Of columns that read the position or the angle of a body or a joint.
+    """
+    out: dict[str, np.ndarray] = {}
+    for s in series:
+        channel, observer = channels[s.name], channels[s.name].observer
+        if not isinstance(observer, Part | JointPart) or observer.field not in RATES:
+            continue
+        if isinstance(observer, JointPart):
+            owner, rate = observer.joint, "rate"
+        else:
+            owner, rate = world.names[observer.body], RATES[observer.field]
+        later = s.t >= start - SAME
+        t, values = s.t[later] - start, (s.values[later] - channel.bias) / channel.scale
+        pose, slope = _turning(world.dim, t, values) if observer.field == "q" else _line(t, values, observer.field)
+        out |= {f"{owner}.{observer.field}": pose, f"{owner}.{rate}": slope}
+    return {path: value for path, value in out.items() if path in paths.catalogue(world)}  # not joints of loops
+
+
+def _line(t: np.ndarray, values: np.ndarray, field: str = "") -> tuple[np.ndarray, np.ndarray]:
+    """Value at t = 0 and slope of straight lines through the first rows, both (size,), NaN where there are too few."""
+    found = np.full((2, values.shape[1]), np.nan)
+    for k, column in enumerate(values.T):
+        rows = np.flatnonzero(np.isfinite(column))[:ROWS]
+        if len(rows) > 1 and t[rows[0]] <= t[rows[-1]] - t[rows[0]]:  # further off, a line says little
+            found[:, k] = np.polyfit(t[rows], np.unwrap(column[rows]) if field == "angle" else column[rows], 1)
+    return found[1], found[0]
+
+
+def _turning(dim: int, t: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First orientation and angular velocity of quaternions (K, 2 or 4)."""
+    so, rows = rotations(dim), np.flatnonzero(np.isfinite(q).all(1))[:ROWS]
+    if not len(rows):
+        return np.full(q.shape[1], np.nan), np.full(2 * dim - 3, np.nan)
+    q = q[rows] / np.linalg.norm(q[rows], axis=1, keepdims=True)
+    first = np.broadcast_to(q[0], q.shape).T
+    turned = known(lambda a, b: so.log(so.difference(a, b)), first, q.T)  # in axes of the body
+    w = _line(t[rows], turned.T)[1]
+    return q[0], w if dim == 2 else known(so.rotate, q[0], w)
