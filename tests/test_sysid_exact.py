@@ -333,7 +333,11 @@ def test_records_that_were_fitted_are_scored_from_what_was_found(fit, records, m
     residuals = np.concatenate([columns["p.x"].ravel() for columns in fit.residuals])
     expected = fit.noise["p.x"] * np.sqrt(np.nanmean(residuals**2))
     assert_allclose(fit.score(backwards)["p.x"], expected, rtol=1e-6)
-    assert fit.score(many(seed=9)[:1])["p.x"] > 5 * expected  # one that was not begins at its own state
+    held = many(seed=9)[0]
+    assert fit.score([held])["p.x"] > 5 * expected  # one that was not begins at its own state
+    assert fit.score(held.observations)["p.x"] > expected  # or as its first rows show
+    with pytest.warns(UserWarning, match="record 0 began at the fitted state of record 0 of the fit"):
+        fit.score([dr.Record(held.observations, start=-0.5)])  # which say little of what was long before
 
 
 def test_profile_agrees_with_the_jacobian_where_the_problem_is_nearly_linear():

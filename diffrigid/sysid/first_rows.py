@@ -36,6 +36,14 @@ def _ends(slot: Slot) -> tuple[float, float]:
     return (slot.kind.low, slot.kind.high) if isinstance(slot.kind, Free) else (-1.0, 1.0)
 
 
+def is_shown(run: Run, slots: Sequence[Slot]) -> bool:
+    """Whether the first rows of a record show all that is free of its initial state."""
+    seen, there = shown(run.world, run.series, run.channels, run.start), paths.catalogue(run.world)
+    wholes = {paths.component(path)[0] for slot in slots for path in slot.paths}
+    initial = [whole for whole in wholes if whole in there and there[whole][0].chain[0] == 1]
+    return all(np.isfinite(seen.get(whole, np.nan)).all() for whole in initial)
+
+
 def with_values(world: World, state: State, values: Mapping[str, np.ndarray]) -> State:
     """A state with these values by path, except where they are NaN."""
     for path in sorted(values, key=lambda path: paths.order_of(world, path)):
@@ -65,7 +73,8 @@ def shown(
         t, values = s.t[later] - start, (s.values[later] - channel.bias) / channel.scale
         pose, slope = _turning(world.dim, t, values) if observer.field == "q" else _line(t, values, observer.field)
         out |= {f"{owner}.{observer.field}": pose, f"{owner}.{rate}": slope}
-    return {path: value for path, value in out.items() if path in paths.catalogue(world)}  # not joints of loops
+    there = paths.catalogue(world)  # without joints of closed loops
+    return {path: value for path, value in out.items() if path in there}
 
 
 def _line(t: np.ndarray, values: np.ndarray, field: str = "") -> tuple[np.ndarray, np.ndarray]:

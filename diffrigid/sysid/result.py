@@ -1,5 +1,6 @@
 """The result of a fit, and what can be asked of it: predictions, scores, other intervals, a report."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,6 +13,7 @@ import numpy as np
 from diffrigid.state import State
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty
 from diffrigid.sysid.diagnosis import correlations
+from diffrigid.sysid.first_rows import is_shown
 from diffrigid.sysid.intervals import derived, describe
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.orders import Orders
@@ -26,6 +28,7 @@ from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
 
 SCORED = 30  # iterations for the own numbers of a record that was held out
+POOR = 3.0  # [-] times the noise of the fit: scores beyond which a start that was not the record's own is doubted
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,8 @@ class Fit:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
 
         Numbers that each record has for itself are fitted anew, from several starts if asked for, the first from its
-        state, by default that of the first record of the fit; for a record that was fitted, from the values found.
+        state, or else from its first rows, and where they show none from the state of the first record of the fit, with
+        a warning if that ends far off; for a record that was fitted, from the values found.
         """
         free, observe = self.problem.free, self.problem.observe
         scored = runs(self.world, self.state, observations, observe, None)
@@ -149,7 +153,24 @@ class Fit:
         values = {
             name: np.concatenate([columns[name].ravel() for columns in found if name in columns]) for name in names
         }
-        return {name: float(np.sqrt(np.nanmean(residuals**2))) for name, residuals in values.items()}
+        sizes = {name: float(np.sqrt(np.nanmean(residuals**2))) for name, residuals in values.items()}
+        borrowed = [
+            k for k, run in enumerate(problem.runs) if not (fitted[k] or run.stated or is_shown(run, problem.own))
+        ]
+        self._warn_of_starts(sizes, borrowed)
+        return sizes
+
+    def _warn_of_starts(self, sizes: dict[str, float], borrowed: list[int]) -> None:
+        """Warn if a score is poor where records began at the state of the first record of the fit."""
+        ratios = {name: size / self.noise.get(name, np.inf) for name, size in sizes.items()}
+        worst = max(ratios, key=lambda name: ratios[name])
+        if borrowed and ratios[worst] > POOR:
+            warnings.warn(
+                f"score: residuals of {worst} are {ratios[worst]:.2g} times the noise of the fit, but record "
+                f"{borrowed[0]} began at the fitted state of record 0 of the fit, as its first rows do not show one: "
+                "give it a first guess, dr.Record(..., state=first), or more starts",
+                stacklevel=3,
+            )
 
     def derived(self, fn: Callable[[World, State], Any], record: int = 0) -> Parameter:
         """A number, or an array, that follows from the fitted scene of a record, with its 95 % interval.
