@@ -19,13 +19,14 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import pieces
 from diffrigid.sysid.points import by_column, linear_of, row_mask
-from diffrigid.sysid.remarks import remarks_on
+from diffrigid.sysid.remarks import failed, remarks_on
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import LEAST, Problem, fitted_scenes, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 
 SQUARES = Squares()
+FAR = 0.1  # [-] of the spread of a column: larger residuals that are not noise are named before a blind parameter
 ALIKE = 0.5, 1e-3  # absolute, and relative to the best loss: a start that ends within their sum agrees with the best
 
 
@@ -158,12 +159,13 @@ def finish(
     if not np.isfinite(costs[best]):
         raise ValueError("fit: no start gives a finite motion: look at the values of the scene, or make dt smaller")
     linear = linear_of(problem, point, best, loss, bool(problem.noise))
-    _refuse_blind(problem, linear)
+    in_units = by_column(problem, point, best, in_units=True)
+    _refuse_blind(problem, linear, in_units)
     shared, own = np.asarray(point.z.shared, float)[:, best], np.asarray(point.z.own, float)[..., best]
     uncertainty = intervals(linear)
     scenes = tuple(fitted_scenes(problem, shared, own))
     residuals = tuple(by_column(problem, point, best))
-    remarks = [*remarks, *remarks_on(problem, scenes, by_column(problem, point, best, in_units=True))]
+    remarks = [*remarks, *remarks_on(problem, scenes, in_units)]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
     order, alike = np.argsort(costs), costs <= costs[best] + ALIKE[0] + ALIKE[1] * costs[best]
     summary = Summary(
@@ -247,13 +249,19 @@ def _all_noise(problem: Problem) -> dict[str, float]:
     return noise
 
 
-def _refuse_blind(problem: Problem, linear: Linear) -> None:
-    """Raise ValueError for a parameter that no residual depends on, instead of a number with an infinite interval."""
+def _refuse_blind(problem: Problem, linear: Linear, residuals: Sequence[dict[str, np.ndarray]]) -> None:
+    """Raise ValueError for a parameter that no residual depends on, instead of a number with an infinite interval.
+
+    Where the fit failed, that comes first: a motion far from the measured one tells nothing of what is seen.
+    """
     sizes = sum((slopes**2).sum(0) for slopes in linear.slopes)
     for slot, rows in pieces(problem.slots):
         if not np.any(sizes[rows] > 0):
+            blind = f"nothing that was measured depends on {slot.name} at the best fit"
+            if failure := failed(problem, residuals, FAR):
+                raise ValueError(f"{failure}. There {blind}")
             raise ValueError(
-                f"free: nothing that was measured depends on {slot.name} at the best fit: "
+                f"free: {blind}: "
                 "leave it out, or give a record that shows it: an impact for restitution, one that slips for friction. "
                 "If there is one, begin closer: with less friction, so that it slips in the simulation too"
             )

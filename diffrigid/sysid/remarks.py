@@ -30,26 +30,40 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
         scenes: fitted, of every record.
         residuals: of every record by column, (K, size), in units of the column, NaN where missing.
     """
-    names = [
-        series.name
-        for run, record in zip(problem.runs, residuals, strict=True)
-        for series in run.series
-        if _is_lost(run, series.name, series.values, record[series.name][: len(series.t)])
-    ]
-    out = []
-    if names:
-        out.append(
-            f"the fit failed: residuals of {', '.join(dict.fromkeys(names))} are as large as the motion; look at units "
-            "(m, s, rad; degrees need scale=180 / pi) and at the values to begin with, or try more starts"
-        )
+    failure = failed(problem, residuals)
+    out = [failure] if failure else []
     out += _torn(scenes[0]) + _light_inertia(problem, scenes[0])
     if np.isfinite(problem.window):
         out.append(f"only the first {problem.window:g} s of each record are fitted")
     return out
 
 
-def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray) -> bool:
-    """Whether residuals are as large as the variation of the measured values, and are not noise."""
+def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], least: float = AS_LARGE) -> str:
+    """Say which residuals are so large that this is no fit; "" if none are.
+
+    Args:
+        residuals: as in `remarks_on`.
+        least: [-] of the spread of a column, from which on residuals that are not noise are too large.
+    """
+    names = [
+        series.name
+        for run, record in zip(problem.runs, residuals, strict=True)
+        for series in run.series
+        if _is_lost(run, series.name, series.values, record[series.name][: len(series.t)], least)
+    ]
+    if not names:
+        return ""
+    size = "as large as" if least >= AS_LARGE else "not small beside"
+    several = ", each() where records differ" if len(problem.runs) > 1 else ""
+    return (
+        f"the fit failed: residuals of {', '.join(dict.fromkeys(names))} are {size} the motion; look at units (m, s, "
+        "rad; degrees need scale=180 / pi), at signs, and at the values to begin with, or try more starts; the start "
+        f"has to be free where it is not known{several}"
+    )
+
+
+def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray, least: float) -> bool:
+    """Whether residuals are at least this share of the spread of the measured values, and are not noise."""
     residuals, values = (part[:, np.isfinite(part).any(0)] for part in (residuals, values))
     if turn := full_turn(run, name):
         values = np.unwrap(values[np.isfinite(values).all(1)], axis=0, period=turn)
@@ -57,7 +71,7 @@ def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray) -> 
     if turn and bool(size > ANYWHERE * turn):
         return True
     turned = residuals.shape[1] != values.shape[1]  # by twice the change of a unit quaternion
-    return bool(size > AS_LARGE * spread * (1.0 + turned)) and whiteness(list(residuals.T)) < RARE
+    return bool(size > least * spread * (1.0 + turned)) and whiteness(list(residuals.T)) < RARE
 
 
 def _torn(scene: Scene) -> list[str]:
