@@ -249,6 +249,9 @@ def test_times_in_milliseconds_are_doubted_before_the_fit():
         "ball": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0)),
         "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
     }
-    t, free = np.linspace(0.0, 2000.0, 61), {"ball.v": dr.real()}
-    with pytest.warns(UserWarning, match="a record of 2e.03 s takes 1e.05 steps of 0.02 s: are its times seconds?"):
-        sysid.make_problem(*dr.scene(bodies), {"t": t, "ball.x": np.zeros((61, 2))}, free=free)
+    free = {"ball.v": dr.real()}
+    for t, steps in ((np.linspace(0.0, 2000.0, 61), "1e.05"), (np.arange(61.0), "3e.03")):
+        data = {"t": t, "ball.x": np.zeros((61, 2))}
+        with pytest.warns(UserWarning, match=f"takes {steps} steps of 0.02 s: are its times in ms"):
+            sysid.make_problem(*dr.scene(bodies), data, free=free)
+    sysid.make_problem(*dr.scene(bodies), data, free=free, dt=0.02)  # no warning: the steps are as they were asked for

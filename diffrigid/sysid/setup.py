@@ -30,6 +30,7 @@ from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
 
 MANY = 50_000  # steps of a record beyond which the unit of its times is doubted
+SPARSE = 40  # likewise steps from one row to the next, where their length was not given
 LEAST = 1e-9  # smallest noise that is estimated, in the unit of its column
 
 
@@ -93,18 +94,25 @@ def make_problem(
         found = _resumed(found, resume, (*shared, *own), range(len(found)) if places is None else places)
         make_slots(free, [scene_of(run) for run in found])  # checks where it goes on from
     longest = longest_step(found, dt)
-    lasts = max(float(series.t[-1]) - run.start for run in found for series in run.series)
-    if lasts > MANY * longest:
-        warnings.warn(
-            f"a record of {lasts:.3g} s takes {lasts / longest:.2g} steps of {longest:.3g} s: are its times seconds?",
-            stacklevel=3,
-        )
+    _doubt_times(found, longest, dt is not None)
     groups = make_groups(found, (*shared, *own), len(shared), longest)
     problem = Problem(
         tuple(found), shared, own, tuple(groups), longest, _common_width(found), np.inf, {}, dict(free),
         dict(observe or {}),
     )  # fmt: skip
     return with_noise(problem, _noise_guesses(found))
+
+
+def _doubt_times(found: Sequence[Run], longest: float, given: bool) -> None:
+    """Warn of times that would take very many steps of `longest` [s], whose length the user gave or not."""
+    lasts = max(float(series.t[-1]) - run.start for run in found for series in run.series)
+    apart = float(np.median(np.concatenate([np.diff(series.t) for run in found for series in run.series])))
+    if lasts > MANY * longest or (apart > SPARSE * longest and not given):
+        warnings.warn(
+            f"a record lasts {lasts:.3g} s, with rows {apart:.2g} s apart, which takes {lasts / longest:.2g} steps of "
+            f"{longest:.2g} s: are its times in ms, or numbers of frames? If they are seconds, give dt",
+            stacklevel=4,
+        )
 
 
 def _common_width(found: Sequence[Run]) -> float:
