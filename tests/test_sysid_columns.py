@@ -188,6 +188,9 @@ def test_a_file_as_spreadsheets_write_it(tmp_path):
     read = read_csv(tmp_path / "semicolons.csv")
     assert_array_equal(read["t"], [0.5, 1.0])
     assert_array_equal(read["cue.x[0]"], [1.5, np.nan])
+    (tmp_path / "lost.csv").write_text("t,cue.x[0]\n0,1\n1,lost\n")
+    with pytest.raises(ValueError, match=r"lost.csv, row 3, column 'cue.x\[0\]' is 'lost': expected numbers"):
+        read_csv(tmp_path / "lost.csv")
 
 
 def test_columns_may_have_times_of_their_own():
@@ -204,11 +207,19 @@ GOOD = {"t": T, "cue.x": np.zeros((6, 2))}
     [
         ({"cue.x": np.zeros((6, 2))}, {}, 'expected a column "t"'),
         ({"time": T, "cue.x": np.zeros((6, 2))}, {}, r"got \['time', 'cue.x'\]; rename"),
-        (GOOD | {"t": T[::-1]}, {}, "increasing times"),
+        (GOOD | {"t": T[::-1]}, {}, "increasing times .* if another run begins there, give each as a record"),
+        (GOOD | {"t": T[[0, 1, 1, 3, 4, 5]]}, {}, "in row 2: leave out one of the two"),
+        (GOOD | {"t": np.where(T == T[2], np.nan, T)}, {}, "in row 2: leave out rows without a time"),
+        ({"t": T, "cue.x": T, "cue.y": T}, {}, r"name the columns cue.x\[0\] and cue.x\[1\]"),
+        ({"t": T, "cue.x": ["0", "lost", *"2345"]}, {}, "with 'lost' in row 1"),
         (GOOD | {"cue.x": np.zeros((6, 3))}, {}, r"expected \(6, 2\) like t in this 2D world"),
         (GOOD | {"cue.x[0]": T}, {}, "leave one out"),
         ({"t": T, "cue.x[2]": T}, {}, r"component \[2\] of 2"),
         (GOOD | {"cu.x": T}, {}, "did you mean 'cue.x'"),
+        *(
+            (GOOD | {name: T}, {}, r"did you mean 'ball.x\[1\]'")
+            for name in ("ball.x1", "ball.x_1", "ball.y", "ball.xy")
+        ),
         (GOOD | {"ball.x": np.full((6, 2), np.nan)}, {}, "every value is NaN"),
         ({"t": T, "cue.x": np.outer(T, (3.0, 0.0)), "cue.v": np.full((6, 2), 3000.0)}, {}, "metres and seconds"),
         ({"t": T}, {}, "nothing is measured"),
@@ -234,6 +245,7 @@ def test_bad_input_of_a_fit(data, arguments, message):
 @pytest.mark.parametrize(
     ("free", "message"),
     [
+        (["cue.v"], "a dict from path to kind"),
         ({"tip.point": dr.real()}, "no parameter 'tip.point'"),
         ({"cue.x": dr.direction(), "cue.mass": dr.direction()}, "expected a vector"),
         ({("cue.mass",): dr.shares()}, "two or more"),

@@ -89,10 +89,10 @@ def test_what_pushes_is_not_taken_for_contact():
 @pytest.mark.parametrize(
     "changed, message",
     [
-        ({"push": None}, r"observations has no column 'push', which a force takes as its control"),
+        ({"push": None}, r"observations has no column 'push', which a force takes as its control: give zeros"),
         ({"push": (CHANGES + 0.01, PUSHES)}, r"observations\['push'\] begins at 0.01 s, after the start 0 s"),
         ({"push": (CHANGES, PUSHES * np.nan)}, r"observations\['push'\] has NaN: expected numbers"),
-        ({"push": (CHANGES, PUSHES[:, :1])}, r"observations\['push'\] has shape \(5, 1\), expected \(5, 2\)"),
+        ({"push": (CHANGES, PUSHES[:, :1])}, r"observations\['push'\] has one number a row, expected 2"),
         ({"p.x": None}, "nothing is measured"),
     ],
 )

@@ -53,12 +53,12 @@ def columns(
         else:
             raise ValueError(f'{where}: expected a column "t" of times [s], got {sorted(gathered)}')
         if name in sizes:
-            controls.append(Series(name, t, _filled(values, len(t), sizes[name], f"{where}[{name!r}]", world)))
+            controls.append(Series(name, t, _filled(values, len(t), sizes[name], name, where, world)))
             if not np.isfinite(controls[-1].values).all():
                 raise ValueError(f"{where}[{name!r}] has NaN: expected numbers in every row of a control")
             continue
         channel = channel_of(name, observe.get(name, name), world)
-        values = _filled(values, len(t), channel.bias.shape[0], f"{where}[{name!r}]", world)
+        values = _filled(values, len(t), channel.bias.shape[0], name, where, world)
         found.append(Series(name, t, values))
         channels[name] = channel
     if unused := set(observe) - set(gathered):
@@ -87,12 +87,15 @@ def read_csv(path: str | Path) -> dict[str, np.ndarray]:
     for number, row in enumerate(body, start=2):
         if len(row) != len(names):
             raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)}, one for each name")
-    try:
-        if mark != ",":
-            body = [[cell.replace(",", ".") for cell in row] for row in body]
-        cells = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in body])
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}; expected numbers under one line of names, empty where missing") from None
+        for name, cell in zip(names, row, strict=True):
+            if cell.strip() and not _is_number(cell.replace(",", ".") if mark != "," else cell):
+                raise ValueError(
+                    f"{path}, row {number}, column {name!r} is {cell!r}: expected numbers under one line of names, "
+                    "empty where missing"
+                )
+    if mark != ",":
+        body = [[cell.replace(",", ".") for cell in row] for row in body]
+    cells = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in body])
     return {name: cells[:, k] for k, name in enumerate(names)} if len(body) else {name: np.zeros(0) for name in names}
 
 
@@ -115,9 +118,18 @@ def _times(t: Any, where: str) -> np.ndarray:
     if len(bad := np.flatnonzero(~(np.diff(t) > 0))):
         k = int(bad[0])
         raise ValueError(
-            f"{where}: expected increasing times without NaN, got {t[k]:g}, then {t[k + 1]:g} in row {k + 1}"
+            f"{where}: expected increasing times without NaN, got {t[k]:g}, then {t[k + 1]:g} in row {k + 1}: "
+            + _fix_of_times(t[k], t[k + 1])
         )
     return t
+
+
+def _fix_of_times(one: float, next_: float) -> str:
+    if np.isnan(one) or np.isnan(next_):
+        return "leave out rows without a time"
+    if one == next_:
+        return "leave out one of the two, every column[np.append(True, np.diff(t) > 0)]"
+    return "if another run begins there, give each as a record, [first, second]; else sort by time"
 
 
 def _floats(values: Any, where: str) -> np.ndarray:
@@ -125,10 +137,26 @@ def _floats(values: Any, where: str) -> np.ndarray:
     try:
         array: np.ndarray = np.asarray(np.ma.filled(np.ma.asarray(values, float), np.nan))
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{where} is {values!r:.80}: expected numbers, NaN where missing") from None
+        raise ValueError(f"{where} is {values!r:.80}{_odd_one(values)}: expected numbers, NaN where missing") from None
     if np.isinf(array).any():
         raise ValueError(f"{where} has infinite values: expected numbers, NaN where missing")
     return array
+
+
+def _odd_one(values: Any) -> str:
+    """Say which of several values is no number; "" if that is not to be seen."""
+    for row, value in enumerate(values if isinstance(values, list | tuple | np.ndarray) else ()):
+        if isinstance(value, str) and not _is_number(value):
+            return f", with {value!r} in row {row}"
+    return ""
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def check_mapping(where: str, value: Any) -> None:
@@ -156,8 +184,9 @@ def _gather(table: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _filled(values: Any, rows: int, size: int, where: str, world: World) -> np.ndarray:
+def _filled(values: Any, rows: int, size: int, name: str, where: str, world: World) -> np.ndarray:
     """Fill a column (K, size) from an array or from some of its components."""
+    where = f"{where}[{name!r}]"
     if isinstance(values, dict):
         if bad := [index for index in values if index >= size]:
             raise ValueError(f"{where}: component [{bad[0]}] of {size} in this {world.dim}D world")
@@ -170,6 +199,11 @@ def _filled(values: Any, rows: int, size: int, where: str, world: World) -> np.n
         return whole
     values = _floats(values, where)
     values = values[:, None] if values.ndim == 1 else values
+    if values.shape == (rows, 1) != (rows, size):
+        parts = " and ".join(f"{name}[{k}]" for k in range(size))
+        raise ValueError(
+            f"{where} has one number a row, expected {size} in this {world.dim}D world: name the columns {parts}"
+        )
     if values.shape != (rows, size):
         raise ValueError(
             f"{where} has shape {values.shape}, expected ({rows}, {size}) like t in this {world.dim}D world"

@@ -139,7 +139,11 @@ def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[
         ValueError: nothing is free, a value of `free` is not a kind, a path is in no scene, two paths set the same
             number, or the kind does not allow the value in a scene.
     """
-    if not isinstance(free, Mapping) or not free:
+    if not isinstance(free, Mapping):
+        raise ValueError(
+            f'free is {free!r:.80}: expected a dict from path to kind, for example {{"restitution": interval(0, 1)}}'
+        )
+    if not free:
         raise ValueError('free: nothing to fit; give paths, for example {"restitution": interval(0, 1)}')
     # Most records have the same parameters.
     unlike = list({(jax.tree.structure((s.world, s.state)), tuple(s.channels)): s for s in scenes}.values())

@@ -102,7 +102,10 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
     if start > first:
         raise ValueError(f"{where}: start is {start:g} s, after the first measured time {first:g} s: make it earlier")
     if missing := controlled(world.forces).keys() - {control.name for control in controls}:
-        raise ValueError(f"{where} has no column {min(missing)!r}, which a force takes as its control")
+        raise ValueError(
+            f"{where} has no column {min(missing)!r}, which a force takes as its control: give zeros where nothing "
+            "acts, or leave the force out of the scene"
+        )
     for control in controls:
         if control.t[0] > start + SAME:
             raise ValueError(

@@ -23,7 +23,8 @@ Every column has besides
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
@@ -330,6 +331,16 @@ def _by_name(name: str, what: str, world: World) -> Any:
         raise ValueError(
             f"observations: no column {name!r} in this {world.dim}D world"
             + ("" if name == what else f", which observes {what!r}")
-            + f": {nearest(what, possible)} Say what other columns observe by observe={{{name!r}: ...}}."
+            + f": {_hint(what, possible)} Say what other columns observe by observe={{{name!r}: ...}}."
         )
     return possible[wanted]
+
+
+def _hint(what: str, possible: Iterable[str]) -> str:
+    """Text on what was meant by the name of a column: by "ball.y", "ball.x1", "ball.x_1" a component."""
+    match = re.fullmatch(r"(.+)\.([xvwq]?)[_.]?([xyz]|\d)", what)
+    whole = f"{match[1]}.{match[2] or 'x'}" if match else ""
+    if match and whole in possible:
+        index = "xyz".index(match[3]) if match[3] in "xyz" else match[3]
+        return f"did you mean '{whole}[{index}]'?"
+    return nearest(what, possible)
