@@ -435,6 +435,13 @@ def test_design_finds_the_launch_that_tells_most():
     )[0]
     best = found.parameters[0]
     assert best.high - best.low < 0.5 * (here.high - here.low)
+    # Seen twice by a column of one number and another of its own name; what is NaN throughout will not be measured.
+    planned = {"t": t, "p.x[0]": None, "p.x[1]": np.full(30, np.nan), "far": None, "p.angle": np.full(30, np.nan)}
+    twice = sysid.expected_intervals(
+        *spring(4.0), planned, free={"spring.stiffness": dr.positive()}, observe={"far": "p.x[0]"},
+        noise={"p.x": 1e-3, "far": 1e-3, "p.angle": 1.0},
+    )[0]  # fmt: skip
+    assert_allclose(twice.high - twice.low, (here.high - here.low) / np.sqrt(2), rtol=1e-4)
 
 
 def test_figures_show_residuals_costs_correlations_and_profiles(fit):

@@ -8,6 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.controls import controlled
+from diffrigid.paths import component
 from diffrigid.state import State
 from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
 from diffrigid.sysid.diagnosis import Coordinate, blind_directions, infinite_where_blind
@@ -17,6 +19,7 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Scene, make_slots, pieces, put, reference
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.records import Record
+from diffrigid.sysid.sensors import channel_of
 from diffrigid.sysid.setup import Problem, first_numbers, first_value, make_problem, make_starts, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.world import World
@@ -135,22 +138,34 @@ def _descended(scores: Callable, u: np.ndarray, steps: int) -> tuple[np.ndarray,
 
 
 def _problem(world: World, state: State, states: Sequence[State], planned, free, noise, observe, dt) -> Problem:
-    t = np.asarray(planned["t"], float)
-    names = [name for name in planned if name != "t"]
-    if missing := [name for name in names if name not in (noise or {})]:
-        raise ValueError(f"noise: expected a standard deviation for every planned column, {missing[0]!r} has none")
-    flat = {name: np.zeros(_shape(world, name, planned[name], t, observe)) for name in names}
-    columns = {n: v if planned[n] is None else np.where(np.isfinite(planned[n]), 0.0, np.nan) for n, v in flat.items()}
-    records = [Record({"t": t, **columns}, state=s) for s in states]
+    t, acting, observe = np.asarray(planned["t"], float), controlled(world.forces), observe or {}
+    columns = {name: values for name, values in planned.items() if name == "t" or name in acting}
+    kept, wholes = set(), {name: _whole(name, observe) for name in planned if name not in columns}
+    for name, whole in wholes.items():
+        if whole not in (noise or {}):
+            raise ValueError(f"noise: expected a standard deviation for every planned column, {whole!r} has none")
+        values = _zeros(world, name, planned[name], len(t), observe)
+        if np.isfinite(values).any():  # else nothing will be measured
+            columns[name] = values
+            kept.add(whole)
+    gone = set(wholes.values()) - kept
+    noise, observe = ({name: v for name, v in given.items() if name not in gone} for given in (noise or {}, observe))
+    records = [Record(columns, state=s) for s in states]
     return make_problem(world, state, records, free=free, noise=noise, observe=observe, dt=dt)
 
 
-def _shape(world: World, name: str, values: Any, t: np.ndarray, observe: Any) -> tuple[int, ...]:
+def _whole(name: str, observe: Mapping[str, Any]) -> str:
+    """Name of the column that a planned one is, or is a component of."""
+    return name if name in observe else component(name)[0]
+
+
+def _zeros(world: World, name: str, values: Any, rows: int, observe: Mapping[str, Any]) -> np.ndarray:
+    """Values of a planned column: zeros, NaN where nothing will be measured; as for all rows if they are None."""
     if values is not None:
-        return np.shape(values)
-    field = name.rsplit(".", 1)[-1] if name not in (observe or {}) else "x"
-    sizes = {"x": world.dim, "v": world.dim, "q": 2 * world.dim - 2, "w": 2 * world.dim - 3}
-    return (len(t), sizes.get(field, 1))
+        return np.where(np.isfinite(np.asarray(values, float)), 0.0, np.nan)
+    whole = _whole(name, observe)
+    size = channel_of(whole, observe.get(whole, whole), world).bias.shape[0]
+    return np.zeros((rows, size) if whole == name else rows)
 
 
 def _linear(problem: Problem) -> Linear:
