@@ -23,10 +23,12 @@ from diffrigid.hull import hull_faces
 from diffrigid.pytree import replace
 from diffrigid.shapes import UNEVEN, Box, HalfSpace, Hull, edges, radius, vertices
 from diffrigid.state import Bodies, State, Wrench, momentum, spin
+from diffrigid.tables import lined_up
 from diffrigid.touch import Convex, gaps, rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.world import World
 
+SHOWN = 30  # impacts that are printed
 SLOP = 2e-3  # [-] of the smaller size: gap up to which bodies touch
 WORK = 4_000_000  # pairs times intervals beyond which not all stored times are examined
 ROUGH = 5.0  # [-] an impulse that exceeds that of the forces in an interval by this factor is an impact
@@ -41,6 +43,21 @@ class Meetings(NamedTuple):
     b: np.ndarray
     point: np.ndarray  # (M, D) [m]
     impulse: np.ndarray  # (M, D) [N s] on one that moves
+    names: tuple[str, ...]  # of the colliders
+
+    def __repr__(self) -> str:
+        """A table of the first impacts, and when which pairs rest on each other."""
+        pairs = np.array([f"{self.names[a]}-{self.names[b]}" for a, b in zip(self.a, self.b, strict=True)], object)
+        strikes = np.flatnonzero(self.impact)
+        rows = [
+            (f"{self.t[k]:.5g}", pairs[k], _numbers(self.point[k]), _numbers(self.impulse[k])) for k in strikes[:SHOWN]
+        ]
+        lines = lined_up(("impact at t [s]", "pair", "point [m]", "impulse [N s]"), rows)
+        lines += [f"and {len(strikes) - SHOWN} more"] if len(strikes) > SHOWN else []
+        for pair in dict.fromkeys(pairs[~self.impact]):
+            t = self.t[~self.impact & (pairs == pair)]
+            lines.append(f"at rest: {pair}, {len(t)} contacts from {t[0]:.3g} to {t[-1]:.3g} s")
+        return "\n".join(lines)
 
 
 class Touch(NamedTuple):
@@ -64,11 +81,17 @@ class Sampled(NamedTuple):
     w: np.ndarray  # (T+1, N + S, A)
 
 
+def _numbers(vector: np.ndarray) -> str:
+    seen = np.where(np.abs(vector) > 1e-9 * np.abs(vector).max(), vector, 0.0)  # without rounding
+    return "  ".join(f"{number:.3g}" for number in seen)
+
+
 def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meetings:
     """Find when, where and with what impulses bodies of a trajectory touch: M contacts in order of time.
 
     `t` (M,) [s], `impact` (M,) or else rest, colliders `a` and `b` (M,) numbered as bodies, then statics; in world axes
-    `point` (M, D) [m] and `impulse` (M, D) [N s] on `a`, or on `b` where only that moves. NumPy, without derivatives.
+    `point` (M, D) [m] and `impulse` (M, D) [N s] on `a`, or on `b` where only that moves; and `names` of all colliders.
+    NumPy, without derivatives. It prints as a table.
 
     A trajectory stores states, and not impulses: these are the least that explain its changes of momentum. Contacts
     with a `Profile` or a `HeightField`, and those within a crowd (256 bodies and more, see `Contact`), are not found.
@@ -81,14 +104,14 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
 
     Example:
         >>> bounce = dr.contacts(trajectory)
-        >>> names = trajectory.world.names + trajectory.world.static_names
-        >>> [(round(t, 2), names[a], names[b]) for t, a, b in zip(bounce.t.tolist(), bounce.a, bounce.b)]
+        >>> [(round(t, 2), bounce.names[a], bounce.names[b]) for t, a, b in zip(bounce.t.tolist(), bounce.a, bounce.b)]
         [(0.43, 'ball', 'floor')]
         >>> bounce.impulse.round(2).tolist()  # m (1 + e) u
         [[0.0, 7.56]]
     """
     checked(trajectory)
     world, dim = trajectory.world, trajectory.world.dim
+    names = world.names + world.static_names
     some = _thinned(trajectory)
     motion, (dp, dL, push) = _motion(some), _changes(some)
     groups = [group for group in world.pairs if not isinstance(world.shapes[group.shape_b], UNEVEN)]
@@ -96,7 +119,7 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     touch = Touch(*(np.concatenate(parts) for parts in zip(*found, strict=True))) if found else None
     if touch is None or not len(touch.s):
         none = np.zeros(0, int)
-        return Meetings(np.zeros(0), none > 0, none, none, np.zeros((0, dim)), np.zeros((0, dim)))
+        return Meetings(np.zeros(0), none > 0, none, none, np.zeros((0, dim)), np.zeros((0, dim)), names)
     impulse = _impulses(world, motion, touch, dp, dL)
     impulse = np.where(touch.a[:, None] < len(world.names), impulse, -impulse)
     size, ends = np.linalg.norm(impulse, axis=1), np.stack([touch.a, touch.b], axis=1)
@@ -109,7 +132,7 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     kept = (size > 1e-6 * size.max()) & (impact | drawn)
     t = motion.t[touch.interval] + touch.s
     kept = np.flatnonzero(kept)[np.argsort(t[kept], kind="stable")]
-    return Meetings(t[kept], impact[kept], touch.a[kept], touch.b[kept], touch.point[kept], impulse[kept])
+    return Meetings(t[kept], impact[kept], touch.a[kept], touch.b[kept], touch.point[kept], impulse[kept], names)
 
 
 def order_of_impacts(trajectory: Trajectory) -> tuple[str, ...]:
@@ -118,10 +141,12 @@ def order_of_impacts(trajectory: Trajectory) -> tuple[str, ...]:
     Several points of one pair at a time are one impact. Those of different pairs that are closer in time than a
     hundredth of a step count as simultaneous, and are listed by name, so that rounding does not tell them apart.
     """
-    found, names = contacts(trajectory, np.zeros(0)), trajectory.world.names + trajectory.world.static_names
+    found = contacts(trajectory, np.zeros(0))
     near = 0.01 * float(np.median(np.diff(trajectory.t)))
     whole = np.cumsum(np.diff(found.t[found.impact], prepend=0.0) > near)  # times that are near share a number
-    pairs = [f"{names[a]}-{names[b]}" for a, b in zip(found.a[found.impact], found.b[found.impact], strict=True)]
+    pairs = [
+        f"{found.names[a]}-{found.names[b]}" for a, b in zip(found.a[found.impact], found.b[found.impact], strict=True)
+    ]
     return tuple(pair for _, pair in sorted(set(zip(whole.tolist(), pairs, strict=True))))
 
 

@@ -59,6 +59,17 @@ class Place(NamedTuple):
     shape: tuple[int, int] | None = None  # group and row of a shape: the value is its density
 
 
+class Catalogue(dict[str, list[Place]]):
+    """Places by path. It prints its paths, those of one owner in a line."""
+
+    def __repr__(self) -> str:
+        owners: dict[str, list[str]] = {}
+        for path in self:
+            owner, _, field = path.partition(".")
+            owners.setdefault(f"{owner}: " if field else "", []).append(field or owner)
+        return "\n".join(owner + ", ".join(fields) for owner, fields in owners.items())
+
+
 def read(world: World, state: State, path: str) -> Array:
     """Value of a parameter, without batch axes: shape () or (D,) or as its leaf has it.
 
@@ -180,14 +191,14 @@ def _item(vector: Array, path: str, index: int) -> Array:
     return _row(vector, index)
 
 
-def catalogue(world: World) -> dict[str, list[Place]]:
-    """Every path of a world, and the places it stands for.
+def catalogue(world: World) -> Catalogue:
+    """Every path of a world, and the places it stands for; prints as a list of the paths.
 
     Example:
         >>> [path for path in dr.paths.catalogue(world) if path.startswith("ball.") and "shape" in path]
         ['ball.shape.radius']
     """
-    out: dict[str, list[Place]] = {}
+    out = Catalogue()
     coefficients = tuple(name for name in COEFFICIENTS if getattr(world.bodies, name) is not None)
     for name in coefficients:
         out[name] = [Place((0, "bodies", name), None)]

@@ -150,6 +150,12 @@ def test_wrong_shapes(path, value, message):
         paths.write(*FLAT, path, value)
 
 
+def test_paths_print_by_owner():
+    lines = repr(paths.catalogue(FLAT[0])).splitlines()
+    assert lines[0] == "restitution, friction, gravity"
+    assert "cue: mass, inertia, restitution, friction, x, q, v, w, angle, density, shape.radius" in lines
+
+
 def test_units():
     assert [paths.unit(FLAT[0], p) for p in ("ball.mass", "ball.shape.radius", "air.linear", "restitution")] == [
         "kg",

@@ -116,6 +116,7 @@ def test_an_impact_is_found_at_its_time_with_its_impulse(dim, spin):
     assert impact[0] == pytest.approx(IMPACT, abs=G * (T[1] - T[0]) ** 2 / 8 / DOWN)
     np.testing.assert_allclose(impact[2 : 2 + dim], np.zeros(dim), atol=1e-4)
     np.testing.assert_allclose(impact[2 + dim :], MASS * (1 + E) * DOWN * np.eye(dim)[-1], atol=1e-6 * MASS * DOWN)
+    assert repr(dr.contacts(run)).splitlines()[2].startswith(f"{impact[0]:.5g}  ")
 
 
 @pytest.mark.parametrize(("dim", "points"), [(2, 2), (3, 4)])

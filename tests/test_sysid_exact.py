@@ -435,6 +435,9 @@ def test_design_finds_the_launch_that_tells_most():
     )[0]
     best = found.parameters[0]
     assert best.high - best.low < 0.5 * (here.high - here.low)
+    lines = [line.split() for line in repr(found).splitlines()]
+    assert ["p.x[0]", f"{found.values['p.x'][0]:.4g}", "m"] in lines
+    assert any(line[0] == "spring.stiffness" and line[-1] == "N/m" for line in lines if line)
     # Seen twice by a column of one number and another of its own name; what is NaN throughout will not be measured.
     planned = {"t": t, "p.x[0]": None, "p.x[1]": np.full(30, np.nan), "far": None, "p.angle": np.full(30, np.nan)}
     twice = sysid.expected_intervals(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.controls import controlled
-from diffrigid.paths import component
+from diffrigid.paths import component, unit
 from diffrigid.state import State
 from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
 from diffrigid.sysid.diagnosis import Coordinate, blind_directions, infinite_where_blind
@@ -22,8 +22,11 @@ from diffrigid.sysid.records import Record
 from diffrigid.sysid.sensors import channel_of
 from diffrigid.sysid.setup import Problem, first_numbers, first_value, make_problem, make_starts, scene_of
 from diffrigid.sysid.summary import Parameter
+from diffrigid.sysid.table import rows_of
+from diffrigid.tables import lined_up
 from diffrigid.world import World
 
+EXPECTED = ("parameter", "value", "expected 95 % interval", "unit")
 NUDGE = 1e-3  # change of z for differences
 QUANTILE = 1.959964  # 97.5 % of the normal distribution are below
 SHRINK, GROW = 0.5, 1.5  # factor on the length of a step that loses, or gains
@@ -38,6 +41,19 @@ class Launch:
     values: dict[str, np.ndarray]  # of the varied parameters, by name
     parameters: tuple[Parameter, ...]  # at their present values, with the interval to expect
     score: float  # mean logarithm of the standard deviations of z; -1 is intervals e times as narrow
+
+    def __repr__(self) -> str:
+        launch = [
+            (
+                name + "".join(f"[{k}]" for k in index),
+                f"{value[index]:.4g}",
+                unit(self.world, name.split(" ")[0]) or "-",
+            )
+            for name, value in self.values.items()
+            for index in np.ndindex(value.shape)
+        ]
+        expected = [row[:4] for parameter in self.parameters for row in rows_of(parameter)]
+        return "\n".join([*lined_up(("launch", "value", "unit"), launch), "", *lined_up(EXPECTED, expected)])
 
 
 def expected_intervals(
