@@ -297,9 +297,9 @@ def states_to_begin_with(scene, records, free):
 
 
 def test_records_begin_as_their_first_rows_show():
-    """In what is free for each: a line through five rows, a hole among them; not where a record gives its state."""
+    """In what is free for each: five rows, a hole among them, on a line or in free fall; not with a state of its own."""
     t = np.arange(9) / 20
-    x = np.stack([5.0 + 2.0 * t, 1.0 - t], 1)
+    x = np.stack([5.0 + 2.0 * t, 1.0 - t - 4.9 * t**2], 1)
     x[2] = np.nan
     thrown = {"t": t, "cue.x": x, "cue.angle": np.mod(3.0 + 4.0 * t, 2 * np.pi)}
     half = {"t": t, "cue.x[1]": x[:, 1], "ball.x": (t + 9.0, x + 1.0)}
@@ -311,7 +311,8 @@ def test_records_begin_as_their_first_rows_show():
     assert_allclose(state.v[0], (2.5, 0.0))  # the end of its interval; the other number is not free
     assert_allclose(state.q[0], (np.cos(3.0), np.sin(3.0)), atol=1e-9)
     assert_allclose(state.w[0], 4.0, atol=1e-9)
-    (state,) = states_to_begin_with(scene, half, {"cue.x": dr.real(), "ball.x": dr.real()})
+    (state,) = states_to_begin_with(scene, half, {"cue.x": dr.real(), "cue.v": dr.real(), "ball.x": dr.real()})
+    assert_allclose(state.v[0], (3.0, -1.0), atol=1e-9)
     assert_allclose(state.x, ((1.0, 1.0), (4.0, 6.0)), atol=1e-9)  # not measured; measured much later
 
 
