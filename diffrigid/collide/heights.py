@@ -39,14 +39,17 @@ SIGHT = 0.5  # [cells] that are looked up beyond the reach of a body, at least
 
 @jax.jit
 def convex_heights(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array) -> Contacts:
-    """The nearest contacts: TOUCHES of every corner and, unless a is a sphere, PEAKS of nodes, CROSSINGS of edges."""
-    return _contacts(a, x_a, q_a, b, x_b, q_b, _nearest)
+    """The nearest contacts: TOUCHES of every corner and, unless a is a sphere, PEAKS of nodes, CROSSINGS of edges.
+
+    Without features at ALERT, which do not touch yet.
+    """
+    return _contacts(a, x_a, q_a, b, x_b, q_b, _nearest, searched=False)
 
 
 @jax.jit
 def candidates(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array) -> Contacts:
     """All contacts that a may reach within the step; no gap is larger than the way left to it."""
-    return _contacts(a, x_a, q_a, b, x_b, q_b, lambda contacts, count, slack: contacts)
+    return _contacts(a, x_a, q_a, b, x_b, q_b, lambda contacts, count, slack: contacts, searched=True)
 
 
 def unseen_for(b: HeightField, q_b: Array, height: Array, v: Array, spinning: Array) -> Array:
@@ -73,10 +76,17 @@ def cells_for(spacing: Array, size: Array) -> Array:
     return jnp.ceil(size / spacing + 0.5 + SIGHT)
 
 
-def _contacts(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array, some: Callable) -> Contacts:
-    """Contacts of all kinds; `some(contacts, count, slack)` selects those of each kind."""
+def _contacts(
+    a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array, some: Callable, *, searched: bool
+) -> Contacts:
+    """Contacts of all kinds; `some(contacts, count, slack)` selects those of each kind.
+
+    Args:
+        searched: with features that may be met within the step, but do not touch yet.
+    """
     so, size = rotations(3), lax.stop_gradient(reach(a, 3))
-    slack, alert = np.sqrt(np.finfo(size.dtype).eps).astype(size.dtype) * size, ALERT * size
+    slack = np.sqrt(np.finfo(size.dtype).eps).astype(size.dtype) * size
+    alert = ALERT * size if searched else jnp.full_like(size, FAR)
     middle = so.unrotate(q_b, x_a - x_b)
     corners = jax.vmap(lambda r: middle + so.unrotate(q_b, so.rotate(q_a, r)))(vertices(a, 3))
     cells = b.cells if isinstance(a, Sphere | Capsule) else 1

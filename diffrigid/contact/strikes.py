@@ -10,7 +10,7 @@ from jax import Array, lax
 
 from diffrigid.branches import any_world, opaque_true, unfused
 from diffrigid.collide import Contacts, PairGroup
-from diffrigid.collide.contacts import ALERT, THERE
+from diffrigid.collide.contacts import THERE
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.held_up import held_up, is_supported
@@ -143,18 +143,15 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     at_a, at_b = up.at_a, up.at_b
     contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
     gaps, apart = up.gaps(contacts), held | is_supported(a, b)  # else the two are where they strike
-    size = smaller_size(a, b)
-    # Also contacts that opened because the body below fell away: they may close again once it is held, or struck. Where
-    # bodies are held up they do not open, and features at ALERT are left alone.
+    # Also contacts that opened because the body below fell away: they may close again once it is held, or struck.
     fall = dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None)
-    fall = jnp.where(is_supported(a, b), jnp.minimum(fall, 0.5 * ALERT * size), fall)
     opened = jnp.where((held | meeting.joins)[None] | rested, fall[None], 0.0)
-    near = contacts.gap <= (meeting.level + meeting.slack)[None] + opened
+    near = gaps <= (meeting.level + meeting.slack)[None] + opened
     there = gaps < THERE  # what rested may have left the face on which it did
     active = (near | (meeting.rests & held[None])) & there & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
-    rounding = gap_rounding(a, at_a, b, at_b)
+    size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
     T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
 
     def each(contact: Contacts, moving: Contacts | None, gap: Array) -> Strikes:
