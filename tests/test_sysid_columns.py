@@ -15,9 +15,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.step import steps_in
+from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.columns import columns, read_csv
 from diffrigid.sysid.parameters import channel_paths
-from diffrigid.sysid.sensors import channel_of, difference, predict
+from diffrigid.sysid.sensors import difference, predict
 
 WORLD, STATE = dr.scene(
     {

@@ -2,7 +2,7 @@
 
 To read it, in the order of a fit; `fit.py` runs it:
 
-    what was measured     columns.py, records.py, sensors.py, times.py
+    what was measured     columns.py, records.py, sensors.py, channels.py, times.py
     what is free          free.py, charts.py (kinds), parameters.py (where they are); losses.py
     the problem           setup.py, first_rows.py, problem.py (from z to residuals), clocks.py, points.py (back)
     solvers               levenberg.py, gradient.py; segments.py for long records

@@ -10,7 +10,8 @@ import numpy as np
 
 from diffrigid.controls import controlled
 from diffrigid.paths import component
-from diffrigid.sysid.sensors import Channel, Part, channel_of
+from diffrigid.sysid.channels import channel_of
+from diffrigid.sysid.sensors import Channel, Part
 from diffrigid.world import World
 
 UNLIKE = 20.0  # [-] speeds that differ by more than this factor from those of the positions have another unit

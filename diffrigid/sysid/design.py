@@ -11,6 +11,7 @@ import numpy as np
 from diffrigid.controls import controlled
 from diffrigid.paths import component, unit
 from diffrigid.state import State
+from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
 from diffrigid.sysid.diagnosis import Coordinate, blind_directions, infinite_where_blind
 from diffrigid.sysid.intervals import coordinates_of, interval_of, unit_of, unseen_of
@@ -19,7 +20,6 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Scene, make_slots, pieces, put, reference
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.records import Record
-from diffrigid.sysid.sensors import channel_of
 from diffrigid.sysid.setup import Problem, first_numbers, first_value, make_problem, make_starts, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import rows_of

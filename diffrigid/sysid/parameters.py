@@ -16,9 +16,10 @@ from jax import Array
 from diffrigid import paths
 from diffrigid.pytree import replace
 from diffrigid.state import State
+from diffrigid.sysid.channels import is_record, parts_of
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.free import Each, Free, Prior
-from diffrigid.sysid.sensors import Channel, is_record, is_turn, parts_of
+from diffrigid.sysid.sensors import Channel, is_turn
 from diffrigid.world import World
 
 
