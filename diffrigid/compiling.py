@@ -23,11 +23,13 @@ LEVEL = "xla_backend_optimization_level"
 QUICK = PLAINER | {LEVEL: 0, "xla_cpu_parallel_codegen_split_count": 1}
 # For programs that run for longer than they compile; where XLA_FLAGS sets a level, as in the tests, that holds.
 LASTING = PLAINER | ({} if LEVEL in os.environ.get("XLA_FLAGS", "") else {LEVEL: 1})
+# For large batches: vectors are as wide as there are, where LLVM by itself takes half of that.
+WIDE = {"xla_cpu_prefer_vector_width": 512}
 # A loop whose step accesses fewer bytes is one function; short loops over the worlds are not written out one by one
-# before they are vectorised, as LLVM else does up to some hundred; and vectors are as wide as there are.
+# before they are vectorised, as LLVM else does up to some hundred.
 SPEED = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000,-unroll-full-max-count=8",
-    "--xla_cpu_prefer_vector_width=512",
+    *(f"--{option}={value}" for option, value in WIDE.items()),
 )
 
 Inputs = ParamSpec("Inputs")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.compiling import LASTING, QUICK, is_for_speed, is_own_program, uncollected
+from diffrigid.compiling import LASTING, QUICK, WIDE, is_for_speed, is_own_program, uncollected
 from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, at_least_one, largest, numbers
@@ -200,7 +200,7 @@ def _rollout(world, state, intervals, controls, counts, memory):
     return scan_steps(*aligned(world, state), intervals, controls, counts, memory)
 
 
-OPTIONS = QUICK, LASTING, None
+OPTIONS = QUICK, LASTING, WIDE, None
 STEP = tuple(jax.jit(_step, compiler_options=options) for options in OPTIONS)
 ROLLOUT = tuple(
     jax.jit(_rollout, static_argnames=("counts", "memory"), compiler_options=options) for options in OPTIONS
@@ -208,7 +208,7 @@ ROLLOUT = tuple(
 
 
 def options_for(inputs: tuple, steps: int, worlds: int) -> int:
-    """Index of the OPTIONS to compile with: for few or small steps, of one world or a few, those that compile sooner.
+    """Index of the OPTIONS to compile with: for few or small steps those that compile sooner, else the faster ones.
 
     For a crowd or a GPU, which would run slower, and where JAX was told to compile for speed, those of JAX; also for
     traced inputs, which may not have options of their own: reverse mode makes a part of another program of them.

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
-from diffrigid.compiling import LASTING, QUICK, is_own_program
+from diffrigid.compiling import LASTING, QUICK, WIDE, is_own_program
 from diffrigid.step import OPTIONS, options_for
 
 SCRIPT = """
@@ -103,7 +103,7 @@ def test_what_runs_for_long_is_compiled_for_longer():
     disc, box = dr.Disc(radius=0.2), dr.Box(half=(0.5, 0.5))
     assert options(disc, 1, 100_000) is QUICK
     assert [options(box, 10, steps) for steps in (1000, 10_000)] == [QUICK, LASTING]
-    assert [options(box, 10, 10, worlds) for worlds in (100, 1000)] == [LASTING, None]
+    assert [options(box, 10, 10, worlds) for worlds in (100, 1000)] == [LASTING, WIDE]
 
     def traced(x):
         assert options(disc, 1, 1) is None  # JAX would refuse it options of its own
