@@ -74,7 +74,11 @@ def angle_between(q, other):
 
 
 def arguments(title, data, test=104):
-    """Of the command line: the file, and how many of its records are fitted, and how many then scored."""
+    """Of the command line: the file, and how many of its records are fitted, and how many then scored.
+
+    To be called before anything else uses JAX, which compiles for speed from here on: a search takes minutes.
+    """
+    dr.compile_for_speed()
     parser = argparse.ArgumentParser(description=title)
     parser.add_argument("--data", type=Path, default=data)
     parser.add_argument("--train", type=int, default=100)
