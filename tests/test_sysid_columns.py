@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import diffrigid as dr
 from diffrigid import sysid
+from diffrigid.state import rotations
 from diffrigid.step import steps_in
 from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.columns import columns, read_csv
@@ -325,6 +326,31 @@ def test_a_tumbling_body_begins_as_its_first_rows_show():
     (state,) = states_to_begin_with((SOLID, SOLID_STATE), {"t": t, "die.q": q}, free)
     assert_allclose(abs(state.q[0] @ first), 1.0, atol=1e-9)
     assert_allclose(state.w[0], w, atol=1e-6)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_body_begins_as_its_markers_show(dim):
+    """Each row with enough of them, whichever they are; two in the plane, in space three that are not on a line."""
+    scene = (WORLD, STATE) if dim == 2 else (SOLID, SOLID_STATE)
+    name, so = scene[0].names[0], rotations(dim)
+    t, v = np.arange(9) / 120, np.arange(1.0, dim + 1)
+    w, first = (np.array([4.0]), np.array([0.6, 0.8])) if dim == 2 else (v[::-1], np.array([0.5, -0.5, 0.5, 0.5]))
+    q = np.asarray(jax.vmap(so.turn_by)(w * t[:, None], jnp.broadcast_to(first, (9, len(first)))))
+    points = 0.1 * np.eye(4, dim) - 0.02
+    at = np.stack([v * t[:, None] + np.asarray(jax.vmap(so.rotate)(q, jnp.broadcast_to(p, (9, dim)))) for p in points])
+    at[0, 1], at[1, 2] = np.nan, np.nan
+    data = {"t": t} | {f"m{k}": 1e3 * values for k, values in enumerate(at)}
+    seen = {f"m{k}": dr.Channel(dr.Marker(name, point=p), scale=1e3) for k, p in enumerate(points)}
+    kinds = {"x": dr.real(), "v": dr.real(), "w": dr.real(), "q": dr.rotation()}
+    free = {f"{name}.{field}": dr.each(kind) for field, kind in kinds.items()}
+    state = sysid.make_problem(*scene, data, free=free, observe=seen).runs[0].state
+    assert_allclose(abs(state.q[0] @ first), 1.0, atol=1e-9)
+    for found, true in ((state.x, np.zeros(dim)), (state.v, v), (state.w, w)):
+        assert_allclose(found[0], true, atol=1e-6)
+    on_a_line = seen | {"m3": dr.Marker(name, point=0.5 * (points[0] + points[1]))}
+    few = {k: data[k] for k in ("t", "m0", "m1", "m3")} if dim == 3 else {k: data[k] for k in ("t", "m0")}
+    observe = {k: on_a_line[k] for k in few if k != "t"}
+    assert_array_equal(sysid.make_problem(*scene, few, free=free, observe=observe).runs[0].state.x, scene[1].x)
 
 
 def test_a_clock_that_jitters_takes_one_step_for_each_frame():

@@ -7,15 +7,17 @@ import numpy as np
 
 from diffrigid import paths
 from diffrigid.convert import known
+from diffrigid.models.frames import to_quaternion
 from diffrigid.state import State, rotations
 from diffrigid.sysid.columns import Series
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.parameters import Slot
 from diffrigid.sysid.records import SAME, Run
-from diffrigid.sysid.sensors import Channel, JointPart, Part
+from diffrigid.sysid.sensors import Channel, JointPart, Marker, Part
 from diffrigid.world import World
 
 ROWS = 5  # rows of a column that the line is laid through
+THIN = 1e-2  # [-] of the length of a cloud of markers: a thinner one does not show how it is turned about its line
 BENT = 10.0  # [-] times the squares left by a parabola: of noise about a line, a line leaves as many 5 % of the time
 RATES = {"x": "v", "angle": "w", "q": "w", "translation": "rate"}  # of a body, or of a slider
 
@@ -59,9 +61,14 @@ def shown(
 ) -> dict[str, np.ndarray]:
     """Poses and velocities at `start` [s] by path, (size,), NaN where the next rows do not show them.
 
-    Of columns that read the position or the angle of a body or a joint.
+    Of columns that read the position or the angle of a body or a joint, or enough markers on a body.
     """
     out: dict[str, np.ndarray] = {}
+    for body, (t, x, q) in _marked(world, series, channels, start).items():
+        out |= dict(zip((f"{body}.x", f"{body}.v"), _line(t, x), strict=True))
+        out |= dict(zip((f"{body}.q", f"{body}.w"), _turning(world.dim, t, q), strict=True))
+        if world.dim == 2:
+            out[f"{body}.angle"] = _line(t, np.arctan2(q[:, 1:], q[:, :1]), "angle")[0]
     for s in series:
         channel, observer = channels[s.name], channels[s.name].observer
         if not isinstance(observer, Part | JointPart) or observer.field not in RATES:
@@ -76,6 +83,45 @@ def shown(
         out |= {f"{owner}.{observer.field}": pose, f"{owner}.{rate}": slope}
     there = paths.catalogue(world)  # without joints of closed loops
     return {path: value for path, value in out.items() if path in there}
+
+
+def _marked(
+    world: World, series: Sequence[Series], channels: Mapping[str, Channel], start: float
+) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Times from the start, positions and orientations in the first rows, of bodies of which these show enough markers.
+
+    Source: the turn that brings points nearest to others, Kabsch 1976.
+    """
+    out, by_body = {}, dict[int, list[Series]]()
+    for s in series:
+        if isinstance(channels[s.name].observer, Marker):
+            by_body.setdefault(channels[s.name].observer.body, []).append(s)
+    for body, markers in by_body.items():
+        t = np.unique(np.concatenate([s.t[s.t >= start - SAME] for s in markers]))
+        places = np.full((len(t), len(markers), world.dim), np.nan)
+        for k, s in enumerate(markers):
+            channel, later = channels[s.name], s.t >= start - SAME
+            places[np.searchsorted(t, s.t[later]), k] = (s.values[later] - channel.bias) / channel.scale
+        points = np.stack([np.asarray(channels[s.name].observer.point, float) for s in markers])
+        known_rows = np.flatnonzero(np.isfinite(places).all(2).sum(1) >= world.dim)[:ROWS]
+        poses = [_pose(points, places[row]) for row in known_rows]
+        if poses:
+            out[world.names[body]] = (t[known_rows] - start, *map(np.stack, zip(*poses, strict=True)))
+    return out
+
+
+def _pose(points: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position and orientation that bring the points of a body (M, D) to their places, NaN where they do not show it."""
+    dim, there = points.shape[1], np.isfinite(places).all(1)
+    r, x = points[there], places[there]
+    middle, center = r.mean(0), x.mean(0)
+    spread = np.linalg.svd(r - middle, compute_uv=False)
+    if spread[dim - 2] <= THIN * spread[0]:
+        return np.full(dim, np.nan), np.full(2 * dim - 2, np.nan)
+    U, _, V = np.linalg.svd((x - center).T @ (r - middle))
+    U[:, -1] *= np.sign(np.linalg.det(U @ V))  # not a mirror image
+    R = U @ V
+    return center - R @ middle, R[:, 0] if dim == 2 else to_quaternion(R)
 
 
 def _line(t: np.ndarray, values: np.ndarray, field: str = "") -> tuple[np.ndarray, np.ndarray]:
