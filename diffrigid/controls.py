@@ -43,6 +43,8 @@ def as_controls(forces: tuple, controls: Any, dtype: Any, steps: tuple[int, ...]
             hint = nearest(unused[0], sizes) if sizes else "give Force or Torque a control."
             raise ValueError(f"controls: no force takes {', '.join(unused)}: {hint}")
 
+    of_forces = {name: numbers(f"controls[{name!r}]", controls[name], None) for name in sizes}
+
     def converted(path: Any, value: Any) -> Any:
         name = getattr(path[0], "key", None) if path else None
         array = lax.convert_element_type(numbers(f"controls[{name!r}]", value, None), dtype)
@@ -53,4 +55,4 @@ def as_controls(forces: tuple, controls: Any, dtype: Any, steps: tuple[int, ...]
             raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {whole}{ending}.")
         return array.reshape(*whole, *[1] * len(batch)) if name in sizes and not rest else array
 
-    return jax.tree_util.tree_map_with_path(converted, controls)
+    return jax.tree_util.tree_map_with_path(converted, {**controls, **of_forces} if of_forces else controls)

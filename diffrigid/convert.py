@@ -15,7 +15,7 @@ import numpy as np
 
 from diffrigid import so2
 from diffrigid.moments import volume_properties
-from diffrigid.pytree import map_arrays, refuse_missing, replace
+from diffrigid.pytree import map_arrays, refuse_missing, replace, undeclared_fields
 from diffrigid.shapes import HalfSpace, dimension, traced, with_topology
 
 TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: typed numbers have a few digits
@@ -280,6 +280,11 @@ def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
     if isinstance(force, type) or not callable(force) or not hasattr(force, "__dataclass_fields__"):
         raise ValueError(f"forces: {name!r} is {force!r}: expected a record such as Drag(linear=0.1).")
     refuse_missing(force, name)
+    if undeclared := undeclared_fields(force):
+        raise ValueError(
+            f"{name}.{undeclared[0]} is not declared: write a force of your own with `array` and `static` of "
+            f"diffrigid.pytree, @pytree class {type(force).__name__}: {undeclared[0]}: Leaf = array()."
+        )
     if not isinstance(getattr(force, "control", None), str | None):
         raise ValueError(f"{name}.control is {force.control!r}: expected the name of a control, or None.")
     changes: dict[str, Any] = {}

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.numerics import dot, normalise
+from diffrigid.numerics import dot, norm, normalise
 from diffrigid.pytree import Leaf, array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, material_point, material_velocity, rotations
 
@@ -40,7 +40,9 @@ class Gravity:
 
 @pytree
 class Drag:
-    """F = -linear * v and tau = -angular * w, on every body: viscous drag, world axes.
+    """F = -linear * v - quadratic * |v| * v and tau = -angular * w, on every body, world axes.
+
+    The linear part is viscous drag; the quadratic one that of air on what is thrown, rho c A / 2 of a ball.
 
     Example:
         >>> puck = dr.Body(dr.Disc(radius=0.1), mass=2.0, x=(0.0, 0.0), v=(1.0, 0.0))
@@ -51,13 +53,17 @@ class Drag:
 
     linear: Leaf = array("D", default=0.0)  # (D, *batch) [N s/m]; a number stands for all directions
     angular: Leaf = array(default=0.0)  # (*batch) [N m s/rad]
+    quadratic: Leaf = array(default=None)  # (*batch) [N s^2/m^2]; None: none
     constant: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
     twists: ClassVar[bool] = True
 
     def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:
         del bodies, controls
-        return Wrench(F=-self.linear[None] * state.v, tau=-self.angular[None, None] * state.w)
+        F = -self.linear[None] * state.v
+        if self.quadratic is not None:
+            F = F - self.quadratic * jnp.stack([norm(v) * v for v in state.v])
+        return Wrench(F=F, tau=-self.angular[None, None] * state.w)
 
 
 @pytree

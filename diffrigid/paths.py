@@ -39,7 +39,8 @@ UNITS = {
     "x": "m", "v": "m/s", "angle": "rad", "w": "rad/s",
     "radius": "m", "half": "m", "half_length": "m", "vertices": "m", "points": "m", "offset": "m", "width": "m",
     "heights": "m", "spacing": "m",
-    "linear": "N s/m", "angular": "N m s/rad", "stiffness": "N/m", "damping": "N s/m", "length": "m",
+    "linear": "N s/m", "quadratic": "N s^2/m^2", "angular": "N m s/rad", "stiffness": "N/m", "damping": "N s/m",
+    "length": "m",
     "translation": "m", "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
     "restitution_falloff": "s/m", "rolling_friction": "m", "spinning_friction": "m",
 }  # fmt: skip

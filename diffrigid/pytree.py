@@ -99,6 +99,16 @@ def refuse_missing(record, where: str) -> None:
             raise ValueError(f"{where}.{field.name} is None: expected numbers.")
 
 
+def undeclared_fields(record) -> list[str]:
+    """Names of the fields that are not said to be arrays or static, and hold no records."""
+    plain = (f.name for f in dataclasses.fields(record) if not {"letters", "static", "stacked"} & set(f.metadata))
+    return [name for name in plain if not _holds_records(getattr(record, name))]
+
+
+def _holds_records(value) -> bool:
+    return value is None or isinstance(value, tuple | dict) or dataclasses.is_dataclass(value)
+
+
 def array_fields(record) -> list[str]:
     """Names of the float leaves of a record."""
     return [field.name for field in dataclasses.fields(record) if "letters" in field.metadata]

@@ -30,6 +30,11 @@ class Trajectory:
 
     def __getitem__(self, path: str) -> Array:
         """Value of a path at every time, (T+1, ...); see `diffrigid.paths`."""
+        if not isinstance(path, str):
+            raise ValueError(
+                f"trajectory[{path!r}]: expected a path such as 'ball.x'; of states pick a time by "
+                f"jax.tree.map(lambda leaf: leaf[{path!r}], trajectory.state)"
+            )
         return jax.vmap(lambda state: read(self.world, state, path))(self.state)
 
     def _repr_html_(self) -> str | None:

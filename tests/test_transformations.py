@@ -1,5 +1,7 @@
 """jit, vmap, batches, types, times and controls change no numbers; forces that vary are fourth order."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -226,6 +228,30 @@ def test_controls_of_a_batch():
     assert_allclose(dr.rollout(world, last, controls={"push": push[0]}, **run).state.v[..., 0], alone[0], rtol=EXACT)
 
 
+def test_controls_may_be_lists():
+    rows = [[1.0, -2.0], [0.0, 0.5], [0.0, 0.0], [3.0, 1.0]]
+    found, same = (dr.rollout(*pushed(), dt=0.1, steps=4, controls={"push": c}).state.v for c in (rows, np.array(rows)))
+    assert_allclose(found, same, rtol=0)
+    with pytest.raises(ValueError, match=r"has shape \(1,\): expected \(2,\)"):
+        dr.step(*pushed(), 0.1, controls={"push": [1.0]})
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Undeclared:
+    """A force of one's own whose number was not declared."""
+
+    k: float
+
+    def __call__(self, bodies, state, controls):
+        return dr.Wrench(F=-self.k * state.v)
+
+
+def test_a_force_says_how_to_declare_its_numbers():
+    with pytest.raises(ValueError, match=r"air.k is not declared: .*k: Leaf = array\(\)"):
+        dr.scene({"ball": PUCK}, forces={"air": Undeclared(k=0.1)})
+
+
 @pytree
 class Wind:
     """A force of one's own, which reads a matrix for each step."""
@@ -299,6 +325,17 @@ def test_drag_is_exponential_decay():
     coarse, fine = error(30), error(60)
     assert (np.abs(np.log2(coarse / fine) - 4.0) < 0.15).all()  # every component
     assert fine.max() < 1e-8
+
+
+def test_quadratic_drag_bounds_the_speed_of_a_fall():
+    """m v' = m g - k v^2 from rest: v = u tanh(g t / u) with u^2 = m g / k."""
+    m, k, g, t = 0.06, 1e-3, 9.81, 2.0
+    ball = dr.Body(None, mass=m, inertia=1.0, x=(0.0, 0.0))
+    scene = dr.scene({"ball": ball}, gravity=(0.0, -g), forces=[dr.Drag(quadratic=k)])
+    u = np.sqrt(m * g / k)
+    end = last(scene, t, 60)
+    assert_allclose(end.v[0], (0.0, -u * np.tanh(g * t / u)), rtol=1e-6)
+    assert_allclose(end.x[0], (0.0, -(u**2) / g * np.log(np.cosh(g * t / u))), rtol=1e-6)
 
 
 def test_spring_and_damper_oscillate():
