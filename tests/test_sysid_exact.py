@@ -93,6 +93,15 @@ def test_noise_and_intervals_are_those_of_linear_regression(fit, exact):
     assert_allclose(half, stdtrit(freedom, 0.975) * np.sqrt(np.diag(covariance)[:2]), rtol=1e-6)
 
 
+def test_akaike_of_a_linear_regression(fit, exact):
+    matrix, right, *_ = exact
+    squares = ((matrix @ np.linalg.lstsq(matrix, right)[0] - right) ** 2).sum() / fit.noise["p.x"] ** 2
+    expected = squares + len(right) * np.log(2 * np.pi * fit.noise["p.x"] ** 2) + 2 * (matrix.shape[1] + 1)
+    assert_allclose(fit.aic, expected, rtol=1e-6)
+    with pytest.raises(ValueError, match="least squares"):
+        dr.replace(fit, loss=dr.huber()).aic  # noqa: B018
+
+
 def test_a_derived_number_has_the_interval_of_the_delta_method(fit, exact):
     """When the point of a record would turn round, -v / g, of a number of its own and a shared one."""
     matrix, right, _, best = exact
@@ -445,6 +454,21 @@ def test_design_finds_the_launch_that_tells_most():
         noise={"p.x": 1e-3, "far": 1e-3, "p.angle": 1.0},
     )[0]  # fmt: skip
     assert_allclose(twice.high - twice.low, (here.high - here.low) / np.sqrt(2), rtol=1e-4)
+
+
+def test_design_for_one_of_several_numbers():
+    """The score is the logarithm of its deviation; aiming at both of them tells less of it."""
+    free = {"spring.stiffness": dr.positive(), "spring.damping": dr.positive()}
+    plan = partial(
+        sysid.best_launch, *spring(4.0), {"t": np.arange(30) / 15, "p.x": None}, free=free, noise={"p.x": 1e-3},
+        vary={"p.x[0]": dr.interval(-1, 1), "p.v[0]": dr.interval(-1, 1)}, starts=2, steps=12,
+    )  # fmt: skip
+    both, one = plan(), plan(target="spring.damping")
+    widths = [np.log(launch.parameters[1].high / launch.parameters[1].low) for launch in (both, one)]
+    assert_allclose(one.score, np.log(widths[1] / (2 * 1.959964)), rtol=1e-6)
+    assert widths[1] < widths[0]
+    with pytest.raises(ValueError, match="'spring.dampin' is not free, did you mean 'spring.damping'"):
+        plan(target="spring.dampin")
 
 
 def test_figures_show_residuals_costs_correlations_and_profiles(fit):

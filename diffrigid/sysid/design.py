@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.controls import controlled
+from diffrigid.convert import nearest
 from diffrigid.paths import component, unit
 from diffrigid.state import State
 from diffrigid.sysid.channels import channel_of
@@ -102,13 +103,14 @@ def blind_spots(
 
 def best_launch(
     world: World, state: State, planned: Mapping[str, Any], *, free: Mapping[Any, Any], noise: Mapping[str, float],
-    vary: Mapping[Any, Any], starts: int = 8, steps: int = 20, seed: int = 0,
+    vary: Mapping[Any, Any], target: str | None = None, starts: int = 8, steps: int = 20, seed: int = 0,
     observe: Mapping[str, Any] | None = None, dt: float | None = None,
 ) -> Launch:  # fmt: skip
-    """The launch whose record would give the narrowest intervals (D-optimal), by gradients from several starts.
+    """The launch whose record would give the narrowest intervals, by gradients from several starts.
 
     Args:
         vary: what can be chosen of the initial state, as `free`: {"ball.v": interval(-3, 3)}.
+        target: the one of `free` to learn, while the others are unknown too; default all of them (D-optimal).
 
     The gradient of the information is by central differences of exact Jacobians, all launches in one batch.
     """
@@ -116,6 +118,7 @@ def best_launch(
     scene = scene_of(plan([state]).runs[0])
     slots, _ = make_slots(vary, [scene])
     about = [np.asarray(reference(slot, scene)) for slot in slots]
+    rows = _rows_of(plan([state]), target)
     count, random = sum(slot.size for slot in slots), np.random.default_rng(seed)
 
     def launched(u: np.ndarray) -> Scene:
@@ -127,7 +130,7 @@ def best_launch(
         points = (u[:, None] + shifts[None]).reshape(-1, count)
         problem = plan([launched(point).state for point in points])
         places = coordinates_of(problem)
-        value = np.array([_score(linear, places) for linear in _linears(problem)]).reshape(starts, -1)
+        value = np.array([_score(linear, places, rows) for linear in _linears(problem)]).reshape(starts, -1)
         return value[:, 0], (value[:, 1 : count + 1] - value[:, count + 1 :]) / (2 * NUDGE)
 
     drawn = [[slot.kind.draw(a, random) for slot, a in zip(slots, about, strict=True)] for _ in range(starts - 1)]
@@ -195,10 +198,21 @@ def _linears(problem: Problem) -> list[Linear]:
     return [Linear((r,), (J,), (t,), linear.shared, 1.0, False) for r, J, t in rows]
 
 
-def _score(linear: Linear, places: Sequence[Coordinate]) -> float:
+def _rows_of(problem: Problem, target: str | None) -> slice:
+    """Rows of the shared numbers that are to be learnt."""
+    if target is None:
+        return slice(0, problem.sizes[0])
+    rows = {slot.name: rows for slot, rows in pieces(problem.shared)}
+    if target not in rows:
+        raise ValueError(f"target: {target!r} is not free, {nearest(target, rows)}")
+    return rows[target]
+
+
+def _score(linear: Linear, places: Sequence[Coordinate], rows: slice) -> float:
     """Mean logarithm of the standard deviations along the axes of the ellipsoid; large where one is infinite."""
     blind = blind_directions(linear, places)
     covariance = infinite_where_blind(from_jacobian(linear).covariance, blind, slice(0, linear.shared))
+    covariance = covariance[rows, rows]
     if not np.isfinite(covariance).all():
         return MANY
     sign, logarithm = np.linalg.slogdet(covariance)

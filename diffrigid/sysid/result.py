@@ -16,6 +16,7 @@ from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.first_rows import is_shown
 from diffrigid.sysid.intervals import derived, describe
 from diffrigid.sysid.levenberg import best_by_record, levenberg
+from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.points import by_column
@@ -65,6 +66,26 @@ class Fit:
     @property
     def costs(self) -> np.ndarray:
         return self.summary.costs
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion, by which two models of the same records are compared: the smaller one predicts better.
+
+        2 k - 2 log L, with k the numbers that were found, those of the noise too, and L the likelihood. `costs` do not
+        tell models apart where the noise is estimated: each is then in units of its own residuals.
+
+        Raises:
+            ValueError: the loss is not that of normal noise.
+        """
+        if not isinstance(self.loss, Squares):
+            raise ValueError(f"aic: expected a fit by least squares, got {self.loss!r}")
+        fitted, total = self.shared.size + self.own.size + len(self.problem.noise), 0.0
+        for run, columns in zip(self.problem.runs, self.residuals, strict=True):
+            for name, r in columns.items():
+                sigma = np.asarray(run.noise.get(name, self.problem.noise.get(name, np.nan)))
+                sigma = sigma[:, None] if sigma.ndim == 1 and len(sigma) == len(r) else sigma
+                total += float(np.nansum(r**2 + np.log(2 * np.pi * sigma**2) * np.where(np.isfinite(r), 1.0, np.nan)))
+        return 2 * fitted + total
 
     @property
     def agree(self) -> int:
