@@ -106,12 +106,13 @@ def _marked(
         known_rows = np.flatnonzero(np.isfinite(places).all(2).sum(1) >= world.dim)[:ROWS]
         poses = [_pose(points, places[row]) for row in known_rows]
         if poses:
-            out[world.names[body]] = (t[known_rows] - start, *map(np.stack, zip(*poses, strict=True)))
+            x, q = map(np.stack, zip(*poses, strict=True))
+            out[world.names[body]] = t[known_rows] - start, x, q
     return out
 
 
 def _pose(points: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position and orientation that bring the points of a body (M, D) to their places, NaN where they do not show it."""
+    """Position and orientation that bring points of a body (M, D) to their places, NaN where these do not show it."""
     dim, there = points.shape[1], np.isfinite(places).all(1)
     r, x = points[there], places[there]
     middle, center = r.mean(0), x.mean(0)
