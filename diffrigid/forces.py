@@ -10,6 +10,7 @@ attributes let the step skip work, and all default to the general case when abse
 
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -62,7 +63,7 @@ class Drag:
         del bodies, controls
         F = -self.linear[None] * state.v
         if self.quadratic is not None:
-            F = F - self.quadratic * jnp.stack([norm(v) * v for v in state.v])
+            F = F - self.quadratic * jax.vmap(lambda v: norm(v) * v)(state.v)
         return Wrench(F=F, tau=-self.angular[None, None] * state.w)
 
 
