@@ -81,6 +81,11 @@ class Revolute:
         along = angle[0] if so.D == 2 else dot(self.axis_a, angle)
         return along if middle is None else middle + along
 
+    def scale(self, a: Pose, b: Pose) -> Array:
+        """What the rounding of the coordinate is relative to, (*batch) [rad]."""
+        del b
+        return jnp.ones_like(a.x[0])
+
 
 def middle_of(lower: Any, upper: Any) -> Any:
     """Middle [rad] of the turn in which the angle of a hinge is counted, by its limits; None: there are none."""
@@ -168,6 +173,10 @@ class Prismatic:
     def coordinate(self, so: ModuleType, a: Pose, b: Pose) -> Array:
         """Translation of anchor a relative to anchor b along the axis, (*batch) [m]."""
         return dot(so.rotate(b.q, self.axis_b), separation(self, so, a, b))
+
+    def scale(self, a: Pose, b: Pose) -> Array:
+        """What the rounding of the coordinate is relative to, (*batch) [m]."""
+        return norm(a.x) + norm(b.x) + norm(self.anchor_a) + norm(self.anchor_b)
 
 
 @pytree

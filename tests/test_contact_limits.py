@@ -309,7 +309,8 @@ def test_friction_of_rounding_has_finite_slopes():
     pair = SimpleNamespace(wholes=("pair",), active=jnp.array([True]))
     slip, at_end, friction = (jnp.full((1, 2), size, jnp.float32) for size in (1e-3, 0.9e-3, 1e-16))
     arguments = jnp.full(1, 4e-3, jnp.float32), slip, at_end, friction, jnp.zeros(1, jnp.float32)
-    lost, back = jax.vjp(functools.partial(lost_to_stops, pair, most_to_stop=jnp.ones(1, jnp.float32)), *arguments)
+    given = {"most_to_stop": jnp.ones(1, jnp.float32), "rest_speed": jnp.float32(1e-3)}
+    lost, back = jax.vjp(functools.partial(lost_to_stops, pair, **given), *arguments)
     assert not lost.any()
     assert all(np.isfinite(slope).all() for slope in back(jnp.ones_like(lost)))
 

@@ -20,13 +20,15 @@ def floor(slope=0.0):
     return dr.Static(dr.HalfSpace(normal=vector(-jnp.sin(slope), jnp.cos(slope)), offset=0.0))
 
 
-def block(mu, v, slope, t):
-    """Distance up the slope at t, 60 steps, of a block that starts there with speed v along it."""
+def block(mu, v, slope, t, metre):
+    """Distance up the slope at t, 60 steps, of a block that starts there with speed v along it; a metre is `metre`."""
     up, normal = vector(jnp.cos(slope), jnp.sin(slope)), vector(-jnp.sin(slope), jnp.cos(slope))
-    body = dr.Body(dr.Box(half=(0.5, 0.5)), mass=1.3, x=0.5 * normal, angle=slope, v=v * up)
-    world, state = dr.scene({"block": body, "floor": floor(slope)}, gravity=(0.0, -G), friction=mu)
+    shape = dr.Box(half=0.5 * metre * vector(1.0, 1.0))
+    body = dr.Body(shape, mass=1.3, x=0.5 * metre * normal, angle=slope, v=v * metre * up)
+    gravity, contact = metre * vector(0.0, -G), dr.Contact(rest_speed=1e-3 * metre)
+    world, state = dr.scene({"block": body, "floor": floor(slope)}, gravity=gravity, friction=mu, contact=contact)
     times = jnp.stack([jnp.zeros_like(t), t])
-    return dr.rollout(world, state, dt=1 / 60, times=times, substeps=(60,)).state.x[-1, 0] @ up
+    return dr.rollout(world, state, dt=1 / 60, times=times, substeps=(60,)).state.x[-1, 0] @ up / metre
 
 
 block_with_slopes = jax.jit(jax.value_and_grad(block, (0, 1, 2, 3)))
@@ -40,6 +42,7 @@ def block_in_closed_form(mu, v, slope, t):
     return way + 0.5 * jnp.minimum(pull + braking, 0.0) * (t - up) ** 2
 
 
+@pytest.mark.parametrize("metre", [1.0, 1e-7])
 @pytest.mark.parametrize(
     "case",
     [
@@ -53,9 +56,9 @@ def block_in_closed_form(mu, v, slope, t):
         (0.3, 0.0, 0.35, 1.0),  # slides above
     ],
 )
-def test_block_on_a_slope(case):
+def test_block_on_a_slope(case, metre):
     p = tuple(map(jnp.asarray, case))
-    distance, slopes = block_with_slopes(*p)
+    distance, slopes = block_with_slopes(*p, jnp.asarray(metre))
     expected, true_slopes = jax.value_and_grad(block_in_closed_form, (0, 1, 2, 3))(*p)
     assert_allclose(distance, expected, atol=1e-12)
     if case[1] == 0.0:  # at the start on the switch from rest to slip: only the slopes by mu and the angle exist

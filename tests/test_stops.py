@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_form import with_slopes
+from closed_form import vector, with_slopes
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
@@ -161,14 +161,34 @@ def test_a_pendulum_rests_on_its_stop():
         assert float(dr.kinetic_energy(world.bodies, jax.tree.map(lambda leaf: leaf[-1], path)).sum()) < 1e-12
 
 
-def test_a_slider_between_elastic_stops_keeps_its_energy():
-    body = dr.Body(None, mass=1.0, inertia=0.1, x=(0.1, 0.0), v=(1.3, 0.0))
-    slider = dr.Prismatic("body", axis_b=(1.0, 0.0), anchor_b=(0.0, 0.0), lower=-0.2, upper=0.3, restitution=1.0)
-    world, state = dr.scene({"body": body}, joints=[slider])
+@pytest.mark.parametrize("metre", [1.0, 1e-9])
+def test_a_slider_between_elastic_stops_keeps_its_energy(metre):
+    body = dr.Body(None, mass=1.0, inertia=0.1, x=(0.1 * metre, 0.0), v=(1.3 * metre, 0.0))
+    ends = dict(lower=-0.2 * metre, upper=0.3 * metre, restitution=1.0)
+    slider = dr.Prismatic("body", axis_b=(1.0, 0.0), anchor_b=(0.0, 0.0), **ends)
+    world, state = dr.scene({"body": body}, joints=[slider], contact=dr.Contact(rest_speed=1e-3 * metre))
     path = dr.rollout(world, state, dt=1 / RATE, steps=4 * RATE).state
-    assert_allclose(jnp.abs(path.v[:, 0, 0]), 1.3, rtol=1e-12)
+    assert_allclose(jnp.abs(path.v[:, 0, 0]), 1.3 * metre, rtol=1e-12)
     way = 0.1 + 1.3 * np.arange(4 * RATE + 1) / RATE + 0.2  # of an image that is not thrown back
-    assert_allclose(path.x[:, 0, 0], 0.5 - np.abs(way % 1.0 - 0.5) - 0.2, atol=1e-12)
+    assert_allclose(path.x[:, 0, 0] / metre, 0.5 - np.abs(way % 1.0 - 0.5) - 0.2, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [100.0, 120.0, 170.0])
+def test_what_rests_on_the_stop_of_what_rests_on_its_stop(angle):
+    """Two links: where both fall freely the second leaves its stop, as it turns more slowly, or goes through it."""
+    first, second = vector(-1.0, 0.0), vector(np.cos(np.radians(angle)), np.sin(np.radians(angle)))
+    bodies = {
+        "first": dr.Body(None, mass=1.0, inertia=0.1, x=0.5 * first),
+        "second": dr.Body(None, mass=1.0, inertia=0.1, x=first + 0.5 * second),
+    }
+    hinges = [
+        dr.Revolute("first", anchor_a=-0.5 * first, upper=0.0),
+        dr.Revolute("second", "first", anchor_a=-0.5 * second, upper=0.0),
+    ]
+    world, state = dr.scene(bodies, gravity=(0.0, -9.81), joints=hinges)
+    states = dr.rollout(world, state, dt=1 / RATE, steps=20).state
+    assert_allclose(states.x, jnp.broadcast_to(state.x[None], states.x.shape), atol=1e-6)
+    assert_allclose(states.w, 0.0, atol=3e-4)
 
 
 @pytest.mark.slow

@@ -70,7 +70,9 @@ def apply_impulses(
     if known is not None:
         P, early_P = P + known.P, early_P + known.early
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
-    friction = None if known is None else reversing(mobility, strikes, P, (dv, dw), law, held_for)
+    friction = None
+    if known is not None:
+        friction = reversing(mobility, strikes, P, (dv, dw), law, held_for, world.contact.rest_speed)
     # A force that has acted evenly has its centroid in the middle of its time, for which it displaces by P / m.
     displacing = jnp.where(kick > 0, 0.5 * held_for, 1.0)[:, None] * P + early_P
     moved = velocities(mobility, *momentum_changes(strikes, displacing, moving))[:2]
@@ -111,11 +113,12 @@ def _solved(
         stopped = rolling_stops
     if known is not None:
         strikes, law = beside(mobility, strikes, law, known)
-    guess = barely(strikes, world.contact.rest_speed)
+    rest_speed = world.contact.rest_speed
+    guess = barely(strikes, rest_speed)
     if known is not None:  # resting contacts have almost no gaps, so what displaces them back is what undid their loads
         guess = jnp.where(kick > 0, guess, -known.P)
-    P = solve_impulses(strikes, law, mobility, count, world.contact.rest_speed, lax.stop_gradient(guess))
-    return strikes, law, held_for, P, stopped(mobility, strikes, P, law, held_for)
+    P = solve_impulses(strikes, law, mobility, count, rest_speed, lax.stop_gradient(guess))
+    return strikes, law, held_for, P, stopped(mobility, strikes, P, law, held_for, rest_speed)
 
 
 def _onto_joints(flight: Flight, t: Array, link: Linkage, hit: Array) -> tuple[Array, Array, Array]:

@@ -55,9 +55,14 @@ def if_smooth(width: Array | None, smooth, exact, *args: Array) -> Any:
     return exact(*args) if width is None else lax.cond(any_world(width > 0), smooth, exact, *args)
 
 
+def rounding(near: Array) -> Array:
+    """Gap [m] that rounding of positions may leave at touching bodies, by the distance that is near."""
+    return ROUNDING * jnp.finfo(near.dtype).eps * near
+
+
 def touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array:
     """Whether a gap is closed, or about to close, and no faster than `slow` [m/s]; rounding does not keep it open."""
-    open_by = jnp.maximum(gap - ROUNDING * jnp.finfo(gap.dtype).eps * near, 0.0)
+    open_by = jnp.maximum(gap - rounding(near), 0.0)
     return (gap <= near) & (v * v + 2.0 * open_by * jnp.abs(acc) <= slow**2)
 
 

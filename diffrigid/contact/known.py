@@ -62,7 +62,7 @@ def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tupl
 
 
 def reversing(
-    mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array
+    mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array, rest_speed: Array
 ) -> Known:
     """Friction where a slip stops and reverses within T, from trial impulses P with friction acting one way.
 
@@ -83,7 +83,7 @@ def reversing(
         against, braked, own = (
             -jax.vmap(dot)(r, back) for r in (slip, friction(relative_changes(strikes, *changes)), rubbed)
         )
-        stops = held & (against > least_slip(T.dtype))
+        stops = held & (against > least_slip(rest_speed)[None])
         # How the full bound brakes the slip, inferred from those impulses if they tell: where friction at all contacts
         # is roughly along it, and brakes as much as the heaviest mass allows.
         across = jax.vmap(norm)(rubbed + own[:, None] * back)

@@ -93,7 +93,7 @@ def _mobility_of_turns(mobility: Mobility, a: tuple[int, ...], b: tuple[int, ...
     return jnp.pad(inverse[:, None, None], [(0, 0), (0, 1), (0, 1), *[(0, 0)] * (inverse.ndim - 1)])
 
 
-def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
+def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array, rest_speed: Array) -> Array:
     """`stopping_early`, extended to rolling and spinning that stop early, (C, D, *batch) [N s^2].
 
     Where a contact sticks, the torque of its row comes with an impulse that keeps the contact from slipping. Both have
@@ -111,8 +111,8 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: A
     for part, bound in parts[: P.shape[1] - 1]:  # in the plane nothing is across
         slip, end, acting = (part(pair.normal, r) for r in (start, at_end, torque))
         of_all = in_all(pair, pair.active, bound)
-        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound, of_all)
-    return _with_reaction(mobility, strikes, sticks, lost) + _of_slips(mobility, strikes, P, law, T)
+        lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound, of_all, rest_speed)
+    return _with_reaction(mobility, strikes, sticks, lost) + _of_slips(mobility, strikes, P, law, T, rest_speed)
 
 
 def rows_of(strikes: Strikes) -> Strikes:
@@ -151,7 +151,7 @@ def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: 
     return jnp.concatenate([sticks[:, None] * P, torque, zero])
 
 
-def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
+def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array, rest_speed: Array) -> Array:
     """`stopping_early` of contacts and rows of joints, with the torques of the rolling rows as an even pull."""
     spin, count = strikes.spin, len(strikes.spin)
     by_torque = moved(put(spin, jnp.zeros_like(P), turning(spin, P)), strikes, mobility)
@@ -163,5 +163,6 @@ def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array
     plain = replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None, spin=None)
     free = others(replace(plain, v_rel=strikes.v_rel + by_torque, pull=pull))
     a, b, wholes = (of_all[:count] + of_all[2 * count :] for of_all in (strikes.a, strikes.b, strikes.wholes))
-    early = stopping_early(mobility, replace(free, a=a, b=b, wholes=wholes), others(P), others(law), others(T))
+    free = replace(free, a=a, b=b, wholes=wholes)
+    early = stopping_early(mobility, free, others(P), others(law), others(T), rest_speed)
     return jnp.concatenate([early[:count], jnp.zeros_like(turning(spin, P)), early[count:]])

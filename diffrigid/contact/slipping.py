@@ -16,7 +16,7 @@ from diffrigid.numerics import dot, norm, safe_divide
 from diffrigid.pytree import replace
 
 STICKS = 1.0 - 1e-6  # [-] of the bound of friction: below it a contact sticks
-CREEP = 1e-6  # [m/s] slower slip counts as none; in single precision sqrt(eps) is larger
+CREEP = 1e-3, 1e3  # [-] of `rest_speed`, the second times sqrt(eps): slip slower than both counts as none
 
 
 def keeping_spin(strikes: Strikes, drift: Array, P: Array, moving: int) -> Array:
@@ -37,7 +37,7 @@ def drift_after(strikes: Strikes, dv: Array) -> Array:
     return strikes.drift + both.reshape(-1, *[1] * (dv.ndim - 1)) * change
 
 
-def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array) -> Array:
+def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array, rest_speed: Array) -> Array:
     """Displacement missed by spreading friction evenly over T where a slip stops earlier, (C, D, *batch) [N s^2].
 
     In fact friction brakes with its full bound until the slip stops at tau, and then only balances the pull. The
@@ -49,7 +49,7 @@ def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: 
     most_to_stop = most_resisting(mobility, strikes) * jax.vmap(norm)(at_end)
     if most is not None:
         most_to_stop = jnp.where(jnp.isfinite(most), bounds, most_to_stop)
-    return lost_to_stops(strikes, T, slip, at_end, part(P), bounds, most_to_stop)
+    return lost_to_stops(strikes, T, slip, at_end, part(P), bounds, most_to_stop, rest_speed)
 
 
 def rubbing(strikes: Strikes, P: Array, law: Law) -> tuple[Callable, Array]:
@@ -83,9 +83,10 @@ def most_resisting(mobility: Mobility, strikes: Strikes) -> Array:
     return 1.0 / (a + b)
 
 
-def least_slip(dtype: Any) -> float:
-    """Speed [m/s] below which a contact does not slip."""
-    return max(CREEP, float(jnp.finfo(dtype).eps) ** 0.5)
+def least_slip(rest_speed: Array) -> Array:
+    """Speed (*batch) [m/s] below which a contact does not slip, where `rest_speed` is slow."""
+    least, rounding = CREEP
+    return rest_speed * max(least, rounding * float(jnp.finfo(rest_speed.dtype).eps) ** 0.5)
 
 
 def in_all(strikes: Any, slipping: Array, values: Array) -> Array:
@@ -94,8 +95,9 @@ def in_all(strikes: Any, slipping: Array, values: Array) -> Array:
 
 
 def lost_to_stops(
-    strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array, most_to_stop: Array
-) -> Array:
+    strikes: Any, T: Array, slip: Array, at_end: Array, friction: Array, bounds: Array, most_to_stop: Array,
+    rest_speed: Array,
+) -> Array:  # fmt: skip
     """Displacement missed by impulses `friction` (C, D, *batch) within `bounds` (C, *batch); see `stopping_early`.
 
     Args:
@@ -104,7 +106,7 @@ def lost_to_stops(
             slip, as at a corner about which a body turns.
     """
     speed, at_end_speed = (jax.vmap(norm)(r) for r in (slip, at_end))
-    slipping = speed > least_slip(T.dtype)
+    slipping = speed > least_slip(rest_speed)[None]
     # Friction against the slip of two clusters, by its power, which is unique where its division among contacts is not.
     power, bound = (in_all(strikes, slipping, each) for each in (-jax.vmap(dot)(friction, at_end), bounds))
     most_power = in_all(strikes, slipping, bounds * at_end_speed)

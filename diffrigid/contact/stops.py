@@ -15,6 +15,8 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.constraints import by_twists, poses
+from diffrigid.contact.approach import rounding, touches
+from diffrigid.contact.gaps import NEAR
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.resting import Strikes
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
@@ -79,13 +81,13 @@ def meet_stops(world: "World", flight: Flight, since: Array, dt: Array, at_end: 
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def find_stops(world: "World", flight: Flight, meeting: Meeting) -> Strikes:
+def find_stops(world: "World", flight: Flight, meeting: Meeting, dt: Array) -> Strikes:
     """Strikes of the rows of all joints, at their meetings."""
     padded, parts, start = _with_statics(world, flight), [], 0
     for stop in stops_of(world):
         group, sides = _rows_of(world, stop, padded)
         own = slice(start, start + len(world.joints[stop.group].a))
-        row: Callable = partial(_row, stop.kind)
+        row: Callable = partial(_row, stop.kind, dt)
         parts.append(jax.vmap(row)(group, *sides, jax.tree.map(lambda leaf, own=own: leaf[own], meeting)))
         start = own.stop
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
@@ -119,10 +121,11 @@ def _struck(
     if kind == "friction":
         never = jnp.zeros(dt.shape, bool)
         return Meeting(s=dt, hit=never | at_end, fast=never, rests=~never[None])
-    gap, start, slack = _gap(kind, joint, a, b), jnp.maximum(a.t0, b.t0), jnp.sqrt(jnp.finfo(dt.dtype).eps)
+    gap, start = _gap(kind, joint, a, b), jnp.maximum(a.t0, b.t0)
     (frozen_joint, *sides), begin, end = lax.stop_gradient(((joint, a, b), since, dt))
     frozen = _gap(kind, frozen_joint, *sides)  # for the search: else it carries tangents in vain
-    free, inside = frozen(begin) > slack, frozen(end) < 0
+    near = _near(joint, a, b, begin)
+    free, inside = frozen(begin) > rounding(near), frozen(end) < 0
 
     def closer(_, ends):
         low, high, s = ends
@@ -138,8 +141,8 @@ def _struck(
     value, slope = _rate(gap, s0)
     slope = lax.stop_gradient(slope)
     s = jnp.where(hit & free, implicit_root(s0, value, slope), jnp.where(hit, start, dt))
-    at_start, rate = _rate(frozen, lax.stop_gradient(start))
-    rests = (at_start <= slack) & (jnp.abs(rate) <= rest_speed) & ~at_end
+    start = lax.stop_gradient(start)
+    rests = touches(*_rate(frozen, start), _second(frozen, start), near, rest_speed) & ~at_end
     return Meeting(s=s, hit=hit | at_end, fast=hit & (slope < -rest_speed), rests=rests[None])
 
 
@@ -148,7 +151,12 @@ def _rate(gap: Callable, s: Array) -> tuple[Array, Array]:
     return jax.jvp(gap, (s,), (jnp.ones_like(s),))
 
 
-def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strikes:
+def _near(joint: Any, a: Flight, b: Flight, s: Array) -> Array:
+    """Gap (*batch) [m or rad] up to which a limit is near."""
+    return NEAR * lax.stop_gradient(joint.scale(*(Pose(position(f, s), f.q) for f in (a, b))))
+
+
+def _row(kind: str, dt: Array, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strikes:
     so, sign, s = rotations(a.dim), -1.0 if kind == "upper" else 1.0, meeting.s
     poses: Any = [Pose(position(f, s), orientation(f, s)) for f in (a, b)]
     inverses = [so.world_inverse(f.inverse_inertia, pose.q) for f, pose in zip((a, b), poses, strict=True)]
@@ -170,12 +178,16 @@ def _row(kind: str, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strik
         pull = safe_divide(rate - _rate(gap, start)[1], s - start)
     else:
         pull = lax.stop_gradient(_second(gap, s))
-    touches = ~meeting.held | meeting.rests[0] | (open_by <= jnp.sqrt(jnp.finfo(s.dtype).eps))
+    # Also a limit that has opened as its bodies fell away: it may close again once they are held.
+    falls = [jnp.concatenate([f.a, so.apply(i, f.tau)]) for i, f in zip(inverses, (a, b), strict=True)]
+    closed = rounding(_near(joint, a, b, s))
+    near = open_by <= closed + dt**2 * jnp.abs((jac * jnp.stack(falls)).sum(1)).sum(0)
     return Strikes(
-        active=meeting.hit & touches, s=s, gap=open_by, rounding=0.0 * s, deepest=jnp.full_like(s, jnp.inf),
-        normal=first, arm_a=none, arm_b=none, K=first[:, None] * first[None] * sum(mobile)[None, None],
-        v_rel=rate[None] * first, press=-pull, pull=pull[None] * first, drift=none, rests=meeting.rests[0],
-        now=meeting.now, held=meeting.held, jac=jac, mid_jac=mid_jac,
+        active=meeting.hit & (~meeting.held | meeting.rests[0] | near), s=s, gap=open_by, rounding=closed,
+        deepest=jnp.full_like(s, jnp.inf), normal=first, arm_a=none, arm_b=none,
+        K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first, press=-pull,
+        pull=pull[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now, held=meeting.held,
+        jac=jac, mid_jac=mid_jac,
     )  # fmt: skip
 
 

@@ -78,7 +78,7 @@ def find_strikes(
         part = unfused(opaque_true(dt), each, *sides, meeting, rested)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
-        stops = find_stops(world, flight, meetings[-1])
+        stops = find_stops(world, flight, meetings[-1], dt)
         jacs = {"jac": stops.jac, "mid_jac": stops.mid_jac}
         mid = stops.arm_a if is_loaded(world) else None
         parts.append(replace(stops, jac=None, mid_jac=None, mid_a=mid, mid_b=mid))
