@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from closed_form import vector
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 import diffrigid as dr
 from diffrigid.collide import COLLIDERS
+from diffrigid.collide.heights import TOUCHES, candidates, convex_heights, of_nearest
 from diffrigid.impacts import contacts
 from diffrigid.overlap import place, separation
 from diffrigid.scene_file import read_scene
-from diffrigid.shapes import with_topology
+from diffrigid.shapes import vertices, with_topology
 from diffrigid.view.frames import shapes
 
 G = 9.81
@@ -94,6 +96,26 @@ def test_gaps_are_finite_everywhere(kind):
         for flat in (0.0, 1.0):
             value, slopes = both(vector(*x), dr.replace(field, heights=flat * field.heights))
             assert all(np.isfinite(leaf).all() for leaf in (value, *jax.tree.leaves(slopes)))
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_a_corner_that_touches_says_nothing_of_another(kind):
+    """On a flat grid: what the candidates of a corner are, its contacts are, and no others."""
+    field = dr.HeightField(heights=jnp.zeros((9, 9)), spacing=jnp.asarray(0.5), cells=3)
+    shape = jax.tree.map(jnp.asarray, with_topology(SHAPES[kind]), is_leaf=lambda leaf: isinstance(leaf, tuple))
+
+    @jax.jit
+    def touching(z):
+        poses = vector(2.1, 1.9, z), vector(0.8, 0.36, -0.48, 0.0), field, jnp.zeros(3), vector(*UNTURNED)
+        near = candidates(shape, *poses).gap < 1e-6
+        gap = convex_heights(shape, *poses).gap
+        return gap, of_nearest(shape, field, near, len(gap))
+
+    height = touching(jnp.asarray(2.0))[0].min()
+    gap, flags = touching(2.0 - height)
+    touches, of_corners = np.flatnonzero(gap < 1e-6), np.flatnonzero(flags[: TOUCHES * len(vertices(shape, 3))])
+    assert len(touches) == 1
+    assert set(of_corners // TOUCHES) == set(touches // TOUCHES)
 
 
 # ---- a sphere
@@ -211,13 +233,18 @@ FLOOR = dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))
 
 @pytest.mark.slow
 def test_on_a_flat_grid_is_on_a_half_space():
-    """States of a box that bounces, tumbles and slides."""
+    """States of a box that bounces, tumbles and slides; and of one that stands on a corner until the next strikes."""
 
-    def thrown(ground):
-        x, v, w = (0.05, 0.03, 0.9), (1.0, 0.3, 0.0), (1.0, 2.0, 0.5)
-        return dr.rollout(*scene_of(ground, SHAPES[dr.Box], x, v, 0.4, 0.3, w=w), dt=1 / 60, steps=48).state
+    def thrown(ground, x, v, w, **turned):
+        return dr.rollout(*scene_of(ground, SHAPES[dr.Box], x, v, 0.4, 0.3, w=w, **turned), dt=1 / 60, steps=48).state
 
-    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-8), thrown(FLAT), thrown(FLOOR))
+    falls = {"x": (0.05, 0.03, 0.9), "v": (1.0, 0.3, 0.0), "w": (1.0, 2.0, 0.5)}
+    tilt, still = np.array([1.0, 0.01, 0.02, 0.0]) / np.linalg.norm([1.0, 0.01, 0.02, 0.0]), (0.0, 0.0, 0.0)
+    low = np.abs(Rotation.from_quat(tilt, scalar_first=True).as_matrix()[2]) @ SHAPES[dr.Box].half
+    stands = {"x": (0.05, 0.03, low), "v": still, "w": still, "q": tilt}
+    for start, atol in ((falls, 1e-8), (stands, 1e-6)):
+        both = thrown(FLAT, **start), thrown(FLOOR, **start)
+        jax.tree.map(lambda a, b, atol=atol: assert_allclose(a, b, atol=atol), *both)
 
 
 LINE = np.array([(0.0, 0.5), (0.5, 0.5), (1.0, 0.1), (1.5, 0.0), (2.0, 0.4), (2.5, 0.2), (3.0, 0.2)])

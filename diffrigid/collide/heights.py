@@ -31,6 +31,7 @@ from diffrigid.shapes import Capsule, HeightField, Sphere, edges, radius, vertic
 from diffrigid.so3 import cross
 from diffrigid.state import rotations
 
+FEATURES = 6  # of a cell: two faces, three edges, a node
 TOUCHES = 4  # contacts of a corner at most: a pit has three faces or more
 PEAKS = 4  # nodes at most that touch a body
 SAME = 1e-6  # [-] 1 - cosine: faces whose normals differ by less than 1.4 mrad are one plane
@@ -50,6 +51,19 @@ def convex_heights(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: A
 def candidates(a, x_a: Array, q_a: Array, b: HeightField, x_b: Array, q_b: Array) -> Contacts:
     """All contacts that a may reach within the step; no gap is larger than the way left to it."""
     return _contacts(a, x_a, q_a, b, x_b, q_b, lambda contacts, count, slack: contacts, searched=True)
+
+
+def of_nearest(a, b: HeightField, flags: Array, count: int) -> Array:
+    """Transfer flags (K, *batch) bool of the `candidates` to the `count` contacts that `convex_heights` selects.
+
+    To those of a corner from its own candidates; to and from nodes and edges, which may take over from any, from all.
+    """
+    corners = len(vertices(a, 3))
+    own = corners * FEATURES * (2 * _cells_of_corners(a, b)) ** 2
+    others = flags[own:].any(0)
+    touching = flags[:own].reshape(corners, -1, *flags.shape[1:]).any(1) | others[None]
+    rest = jnp.broadcast_to(flags.any(0), (count - corners * TOUCHES, *flags.shape[1:]))
+    return jnp.concatenate([jnp.repeat(touching, TOUCHES, 0), rest])
 
 
 def unseen_for(b: HeightField, q_b: Array, height: Array, v: Array, spinning: Array) -> Array:
@@ -89,7 +103,7 @@ def _contacts(
     alert = ALERT * size if searched else jnp.full_like(size, FAR)
     middle = so.unrotate(q_b, x_a - x_b)
     corners = jax.vmap(lambda r: middle + so.unrotate(q_b, so.rotate(q_a, r)))(vertices(a, 3))
-    cells = b.cells if isinstance(a, Sphere | Capsule) else 1
+    cells = _cells_of_corners(a, b)
 
     def touching(p: Array) -> Contacts:
         around, rounding = _around(b, p, cells), radius(a)
@@ -113,6 +127,11 @@ def _contacts(
         c = _joined(c, _moved(_joined(peaks, ridges), middle))
     normal, point = (jax.vmap(lambda r: so.rotate(q_b, r))(r) for r in (c.normal, c.point))
     return Contacts(gap=c.gap, normal=normal, point=point + x_b[None])
+
+
+def _cells_of_corners(a, b: HeightField) -> Any:
+    """Number of cells to each side of a corner that are looked up; static."""
+    return b.cells if isinstance(a, Sphere | Capsule) else 1
 
 
 def _joined(*parts: Contacts) -> Contacts:

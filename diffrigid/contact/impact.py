@@ -18,6 +18,7 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import opaque_true, unfused
+from diffrigid.collide.heights import of_nearest
 from diffrigid.collide.profile import on_next_segments
 from diffrigid.contact.approach import if_smooth, touches
 from diffrigid.contact.gaps import NEAR, at_corners
@@ -38,7 +39,7 @@ from diffrigid.contact.sides import (
     smaller_size,
 )
 from diffrigid.numerics import FOUND, dot, implicit_root, norm, normalise, safe_divide, safe_sqrt, softplus
-from diffrigid.shapes import Disc, HalfSpace, Profile, Shape, Sphere
+from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Shape, Sphere
 from diffrigid.state import rotations
 
 AT_ONCE = 1e-8  # [-] of the smaller size: contacts whose gaps differ by no more, or by their rounding, strike at once
@@ -97,8 +98,8 @@ def find_impact(
     s = jnp.where(inside.any(0) & (s0 <= begin), begin, s)
     s = jnp.where(at_end, t1, s)  # moves with the length of the step
     if len(rests) != len(gap):  # contacts are a selection: of the corners of a box, or of places on a grid
-        few = isinstance(b.shape, HalfSpace)
-        rests = at_corners(a, at_a, contacts, rests) if few else jnp.broadcast_to(rests.any(0), gap.shape)
+        on_grid = isinstance(b.shape, HeightField)
+        rests = of_nearest(a.shape, b.shape, rests, len(gap)) if on_grid else at_corners(a, at_a, contacts, rests)
     elif isinstance(b.shape, Profile):
         rests = on_next_segments(a.shape, b.shape, rests)
     return Meeting(s=s, hit=hit | at_end, fast=closes.any(0), rests=rests & ~at_end, level=level, slack=slack)
