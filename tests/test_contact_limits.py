@@ -27,6 +27,7 @@ from numpy.testing import assert_allclose
 import diffrigid as dr
 from diffrigid.contact.impulse import contact_law, impulses
 from diffrigid.contact.slipping import lost_to_stops
+from diffrigid.overlap import place, separation
 
 EXACT = 1e-9  # relative: rounding of a few hundred steps
 AT_REST = 1e-9  # [m], [m/s]: rounding of a body that is held for a thousand steps
@@ -347,6 +348,24 @@ def test_a_corner_that_rests_hides_no_impact_of_another():
     rotate = jax.vmap(jax.vmap(dr.state.rotations(3).rotate, (None, 0)), (0, None))
     lowest = s.x[:, 0, 2] + rotate(s.q[:, 0], jnp.asarray(corners))[..., 2].min(1)
     assert lowest.min() > -1e-5  # 15 mm where an impact is found a step late
+
+
+@pytest.mark.slow
+def test_an_edge_that_rests_hides_no_impact_of_another():
+    """An edge of a box tips over one edge of another box and strikes a second, beside a corner: the nearer is first."""
+    box, block = dr.Box(half=(0.15, 0.1, 0.08)), dr.Box(half=(0.4, 0.3, 0.2))
+    start = {
+        "x": (0.40018397933968075, -0.3, 0.37207707846845434),
+        "q": (-0.22018465723828828, 0.5848283496874436, 0.3991205097914665, 0.6709674632815801),
+        "v": (0.011091838253897457, 0.0, -0.4060603726482718),
+        "w": (4.550815093491126, 0.40151602668759034, -3.27105393217865),
+    }
+    body = dr.Body(box, mass=1.0, inertia=(0.01, 0.012, 0.014), **start)
+    world, state = dr.scene({"box": body, "block": dr.Static(block)}, gravity=(0.0, 0.0, -G))
+    end = dr.step(world, state, 1 / 480)
+    x, q, none = np.asarray(end.x[0]), np.asarray(end.q[0]), np.zeros(3)
+    apart = separation(place(box, x, q, none), place(block, none, np.array([1.0, 0.0, 0.0, 0.0]), none))
+    assert apart > -1e-6  # 0.5 mm where the second is taken for the first
 
 
 def test_what_tumbles_on_a_box_does_so_as_on_a_half_space():

@@ -88,6 +88,16 @@ def taking_over(task: Task, gaps: Gaps, rests: Array) -> Array:
     return rests | (touches(gap, v, gaps.acceleration, near, slow) & is_supported(task.a, task.b)[None])
 
 
+def falling(task: Task, gaps: Gaps, rests: Array) -> Array:
+    """`rests` (K, *batch) without contacts that close faster than they can have fallen since the start.
+
+    Crossings of edges are listed by their gaps: of those that touch, one that strikes may take the place of one that
+    rested.
+    """
+    least = task.slow[None] + 2.0 * jnp.abs(gaps.acceleration) * jnp.maximum(task.span, 0.0)[None]
+    return rests & (gaps.rate >= -least)
+
+
 def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:
     """Make the function: time from s before which only resting contacts can close, (*batch) [s]; <= 0: one is closing.
 

@@ -22,7 +22,17 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import any_world, choose, opaque_true
-from diffrigid.contact.approach import Polish, Task, clearance, if_smooth, polish, resting, taking_over, task_of
+from diffrigid.contact.approach import (
+    Polish,
+    Task,
+    clearance,
+    falling,
+    if_smooth,
+    polish,
+    resting,
+    taking_over,
+    task_of,
+)
 from diffrigid.contact.gaps import Gaps, gaps_at
 from diffrigid.contact.nearing import Closest, Nearing, from_time, level_at, look_at, nearer
 from diffrigid.contact.sides import Side, earliest
@@ -181,9 +191,9 @@ def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
 
     def follow(now: Search, gaps: Gaps) -> Search:
         rests = taking_over(task, gaps, jnp.where(now.count == 0, resting(task, gaps), now.rests))
-        now = now._replace(count=now.count + 1, rests=rests)
+        now, rests = now._replace(count=now.count + 1, rests=rests), falling(task, gaps, rests)
         now = choose(now.stage == ADVANCING, _advanced(task, now, clear(gaps, rests, now.s)), now)
-        following = choose(now.stage == POLISHING, _polished(task, now, gaps), now)
+        following = choose(now.stage == POLISHING, _polished(task, now, gaps, rests), now)
         if task.width is None:
             return following
         nears = now.stage == NEARING
@@ -206,9 +216,9 @@ def _advanced(task: Task, now: Search, dt: Array) -> Search:
     return now._replace(s=s, near=now.s, stage=jnp.where(arrived, following, ADVANCING).astype(np.int32))
 
 
-def _polished(task: Task, now: Search, gaps: Gaps) -> Search:
+def _polished(task: Task, now: Search, gaps: Gaps, rests: Array) -> Search:
     """Search after a step to where the first contact that does not rest reaches its level, if one does."""
-    look = polish(task, gaps, now.rests, now.level, now.s)
+    look = polish(task, gaps, rests, now.level, now.s)
     done = look.converged(task) | (now.tries >= POLISH)
     return now._replace(
         s=now.s + look.dt, found=look.found(task), inside=jnp.where(now.tries == 0, look.inside, now.inside),
