@@ -86,9 +86,9 @@ def rollout_batch(
 def _controls(world: World, controls: Any, dtype: Any, steps: int, count: int) -> Any:
     """Controls of the whole batch, with the batch last: (T, D or A, B), or of length 1 where all worlds share them."""
     if isinstance(controls, Mapping):
-        sizes = controlled(world.forces)
+        sizes = controlled(world.forces, -1)
         controls = {k: _batch_last(k, v, (steps, sizes[k]), count) if k in sizes else v for k, v in controls.items()}
-    return as_controls(world.forces, controls, dtype, (steps,), (count,))
+    return as_controls(world.forces, controls, dtype, (steps,), (count,), axis=-1)
 
 
 def _batch_last(name: str, value: Any, own: tuple[int, int], count: int) -> Any:

@@ -13,24 +13,31 @@ from diffrigid.convert import nearest, numbers
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
 
 
-def controlled(forces: tuple) -> dict[str, int]:
-    """Number of components of each control, by its name."""
+def controlled(forces: tuple, axis: int = 0) -> dict[str, int]:
+    """Number of components of each control, by its name.
+
+    Args:
+        axis: of the components in the forces: the first, or where a batch comes first the last (-1).
+    """
     added = (force for force in forces if isinstance(force, Force | Torque))
-    sizes = {force.control: len(force.F if isinstance(force, Force) else force.tau) for force in added}
+    sizes = {force.control: (force.F if isinstance(force, Force) else force.tau).shape[axis] for force in added}
     return {name: size for name, size in sizes.items() if name is not None}
 
 
-def as_controls(forces: tuple, controls: Any, dtype: Any, steps: tuple[int, ...], batch: tuple[int, ...] = ()) -> Any:
+def as_controls(
+    forces: tuple, controls: Any, dtype: Any, steps: tuple[int, ...], batch: tuple[int, ...] = (), axis: int = 0
+) -> Any:
     """Check controls and convert them to arrays of a type.
 
     Args:
         steps: (T,), or () for one step.
         batch: trailing axes that a control may have; those without are given as many of length one.
+        axis: as in `controlled`.
 
     Raises:
         ValueError: one that a force asks for is missing, has no force, or is not of the shape (*steps, D or A).
     """
-    sizes = controlled(forces)
+    sizes = controlled(forces, axis)
     if controls is None and not sizes:
         return None
     given = controls if isinstance(controls, Mapping) else {}

@@ -218,6 +218,8 @@ def test_controls_of_a_batch():
     for chunk in (1, 2, 3):
         batch = dr.rollout_batch(world, states, controls={"push": push}, chunk=chunk, **run)
         assert_allclose(batch.v, alone, rtol=EXACT)
+    worlds = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), world)
+    assert_allclose(dr.rollout_batch(worlds, states, controls={"push": push}, **run).v, alone, rtol=EXACT)
     same = dr.rollout_batch(world, states, controls={"push": push[0]}, final_only=True, **run)
     assert_allclose(same.v[0], alone[0, -1], rtol=EXACT)
     last = dr.replace(jax.tree.map(lambda leaf: jnp.stack([leaf] * 3, -1), state), v=jnp.moveaxis(v, 0, -1))
