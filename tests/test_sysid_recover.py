@@ -26,6 +26,25 @@ def missing(random, values, noise):
     return np.where(random.random(values.shape) < 0.1, np.nan, measured)
 
 
+def test_a_friction_at_the_end_of_slip_has_no_upper_limit():
+    """A disc that sticks when it strikes from some friction on: just below it all larger ones fit as well."""
+
+    def disc(friction):
+        ball = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0), v=(2.0, 0.0))
+        floor = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+        return dr.scene({"ball": ball, "floor": floor}, gravity=(0.0, -9.81), restitution=0.7, friction=friction)
+
+    sticks = 2.0 / (3.0 * 1.7 * np.sqrt(2 * 9.81 * 0.9))  # v / 3 over (1 + e) times the speed of the impact
+    t = np.arange(36) / 60
+    free = {"friction": dr.interval(0, 1)}
+    for share, said in ((0.995, True), (0.8, False)):
+        measured = np.asarray(dr.rollout(*disc(share * sticks), dt=1 / 60, steps=35)["ball.x"])
+        found = dr.fit(
+            *disc(share * sticks), {"t": t, "ball.x": measured}, free=free, noise={"ball.x": 1e-3}, progress=False
+        )
+        assert ("larger values fit as well" in repr(found)) == said
+
+
 # ---- a ball that bounces, slips and spins in air, under a tilted gravity
 
 BALL = {

@@ -19,7 +19,7 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import pieces
 from diffrigid.sysid.points import by_column, linear_of, row_mask
-from diffrigid.sysid.remarks import failed, remarks_on
+from diffrigid.sysid.remarks import failed, remarks_on, sticking
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import LEAST, Problem, fitted_scenes, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Summary, versions
@@ -165,7 +165,8 @@ def finish(
     uncertainty = intervals(linear)
     scenes = tuple(fitted_scenes(problem, shared, own))
     residuals = tuple(by_column(problem, point, best))
-    remarks = [*remarks, *remarks_on(problem, scenes, in_units)]
+    stuck = sticking(problem, point, best, linear, uncertainty.covariance)
+    remarks = [*remarks, *remarks_on(problem, scenes, in_units), *stuck]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
     order, alike = np.argsort(costs), costs <= costs[best] + ALIKE[0] + ALIKE[1] * costs[best]
     summary = Summary(

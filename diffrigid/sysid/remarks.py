@@ -2,16 +2,22 @@
 
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.constraints import joint_errors, placed
 from diffrigid.flight import has_torque
 from diffrigid.joint_motion import fields_of, moving_side
-from diffrigid.paths import catalogue, read, write
+from diffrigid.paths import catalogue, component, read, write
 from diffrigid.shapes import Disc, Sphere
 from diffrigid.state import rotations
+from diffrigid.sysid.covariance import Linear
 from diffrigid.sysid.diagnosis import RARE, whiteness
-from diffrigid.sysid.parameters import Scene
+from diffrigid.sysid.levenberg import Point, point_at
+from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.parameters import Scene, pieces
+from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.problem import full_turn
 from diffrigid.sysid.records import Run
 from diffrigid.sysid.setup import Problem
@@ -20,6 +26,7 @@ from diffrigid.world import World
 AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are autocorrelated, mean that the fit failed
 ANYWHERE = 0.25  # [-] of a turn: residuals of uniformly random angles are 1 / sqrt(12) of a turn
 OTHER = 1.1  # [-] change of the mass of a solid body beyond which an unchanged inertia is doubted
+ONE_SIDED = 0.1  # [-] of the information on a friction at the best fit: less a little above it is an end of slip
 TORN = 1e-3  # [m or rad] largest error of a joint at the fitted start without a remark
 
 
@@ -35,6 +42,24 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
     out += _torn(scenes[0]) + _light_inertia(problem, scenes[0])
     if np.isfinite(problem.window):
         out.append(f"only the first {problem.window:g} s of each record are fitted")
+    return out
+
+
+def sticking(problem: Problem, point: Point, best: int, linear: Linear, covariance: np.ndarray) -> list[str]:
+    """Remarks on frictions that ended where what slipped begins to stick, so that larger ones fit as well."""
+    information, out = sum((slopes**2).sum(0) for slopes in linear.slopes), []
+    for slot, rows in pieces(problem.shared):
+        one = rows.start
+        if not component(slot.paths[0])[0].endswith("friction") or not 0 < covariance[one, one] < np.inf:
+            continue
+        z = jax.tree.map(lambda leaf: jnp.repeat(leaf[..., best : best + 1], leaf.shape[-1], -1), point.z)
+        above = z._replace(shared=z.shared.at[one].add(2.0 * np.sqrt(covariance[one, one])))
+        slopes = linear_of(problem, point_at(problem.groups, above), best, Squares(), False).slopes
+        if sum((jacobian[:, one] ** 2).sum() for jacobian in slopes) < ONE_SIDED * information[one]:
+            out.append(
+                f"{slot.name} ended where what slips begins to stick: larger values fit as well, whatever the upper "
+                f'end of its interval; see dr.profile(fit, "{slot.name}")'
+            )
     return out
 
 
