@@ -69,7 +69,7 @@ class Fit:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion, by which two models of the same records are compared: the smaller one predicts better.
+        """Akaike's criterion. Of two models of the same records that with the smaller one predicts better.
 
         2 k - 2 log L, with k the numbers that were found, those of the noise too, and L the likelihood. `costs` do not
         tell models apart where the noise is estimated: each is then in units of its own residuals.
