@@ -204,3 +204,10 @@ def test_a_density_sets_mass_and_inertia_by_the_shape():
     with pytest.raises(ValueError, match="set the same number"):
         free = {"body.density": dr.positive(), "body.inertia": dr.inertia()}
         dr.sysid.make_problem(world, state, {"t": np.arange(3.0), "body.x": np.zeros((3, 3))}, free=free)
+
+
+def test_a_trajectory_asked_for_a_row_says_how_to_pick_it():
+    world, state = dr.scene({"ball": dr.Body(None, mass=1.0, inertia=1.0, x=(0.0, 0.0))})
+    alone = dr.Trajectory(t=np.zeros(1), state=state, world=world)
+    with pytest.raises(ValueError, match=r"trajectory\[0\]: expected a path .* leaf\[0\], trajectory.state"):
+        alone[0]
