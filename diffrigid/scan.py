@@ -13,7 +13,7 @@ from diffrigid.contact.strikes import ends, is_rolling
 from diffrigid.devices import on_cpu
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
-from diffrigid.numerics import FOUND, PASSED, saving, with_tangents
+from diffrigid.numerics import FOUND, PASSED, normalise, saving, with_tangents
 from diffrigid.pytree import align, batch_rank, replace
 from diffrigid.state import State
 from diffrigid.world import World
@@ -40,8 +40,10 @@ def aligned(world: World, state: State) -> tuple[World, State]:
     """World and state with the same number of batch axes, and the state with all of the batch.
 
     The world, too, has all of the batch where rows of joints or rolling rows are listed beside contacts. Inertias are
-    made symmetric here, so that they are whatever entry is changed, and have symmetric gradients.
+    made symmetric here, so that they are whatever entry is changed, and have symmetric gradients; and orientations are
+    brought to unit length, as all that follows takes for granted.
     """
+    state = replace(state, q=jax.vmap(normalise)(state.q))
     if world.dim == 3:
         inertia = world.bodies.inertia
         inertia = 0.5 * (inertia + jnp.swapaxes(inertia, 1, 2))

@@ -155,6 +155,13 @@ def test_rollout_is_steps():
 # ---- times
 
 
+def test_an_orientation_counts_by_its_direction():
+    """A state made by hand may have one that is not of unit length."""
+    world, state = made(disc_and_plane, RUB)
+    longer = dr.replace(state, q=3.0 * state.q)
+    assert_same(dr.step(world, longer, 1 / 60), dr.step(world, state, 1 / 60), ROUNDING)
+
+
 def test_rollout_lands_on_given_times_and_is_differentiable_in_them():
     times = jnp.asarray([0.1, 0.15, 0.3, 0.417, 0.5])  # the state is that at 0.1 s; the ball bounces 0.23 s later
     p = BALL | dict(vy=0.0)
