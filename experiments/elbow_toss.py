@@ -12,19 +12,19 @@ simulation a toss from its start, mean over frames of the distance of link 1 in 
 rotation, and that of link 2 against where the measured hinge angle has it. Beside it, what the source of the data
 puts in: equal masses, 6.167e-4 kg m^2 about all axes, friction 0.3.
 
-Result (November 2026). Flights of 100 tosses: ratio 1.2 (0.61 to 2.4), inertia 1.4 (0.65 to 3.1), damping 0.0030
-(0.0014 to 0.0058) N m s/rad: the flights show that the hinge rubs, and little about the masses. Open loop on the other
-104, from the velocities of the first two frames instead of fitted starts:
+Result (November 2026; 70 minutes on one core). Flights of 100 tosses: ratio 1.2 (0.61 to 2.4), inertia 1.4 (0.65 to
+3.1), damping 0.0030 (0.0014 to 0.0058) N m s/rad: the flights show that the hinge rubs, and little about the masses.
+Whole tosses: friction 0.18 (0.15 to 0.20), as a cube on the same board has it, restitution 0.28 (0.20 to 0.31), dry
+friction of the hinge 0.020 N m (0.003 to 0.025), ratio 1.35 (0.75 to 1.6), inertia 2.5 (1.7 to 2.7), which is more than
+a hollow box has. Open loop on the other 104:
 
-    as the source has it, restitution 0            65 +- 3 %, 72 +- 3 degrees, hinge 65 +- 4 degrees
-    friction and restitution 0.15                  51 +- 2 %, 69 +- 3 degrees, hinge 60 +- 4 degrees
-    and ratio, inertia, damping of the flights,
-    and 0.005 N m of dry friction in the hinge     52 +- 3 %, 67 +- 3 degrees, hinge 56 +- 4 degrees
+    found by the search                            49 +- 3 %, 68 +- 3 degrees, hinge 61 +- 4 degrees
+    from velocities of two frames as starts        54 +- 3 %, 70 +- 3 degrees, hinge 60 +- 4 degrees
+    as the source has it, restitution 0            64 +- 3 %, 73 +- 3 degrees, hinge 64 +- 4 degrees
 
-The lower two were tried by hand, with these tosses in view: the search of the second stage has not been run to its
-end. From such starts the model is 5 degrees off at the first impact, and in the 15 frames after it 48 other values of
-all six numbers gave a mean of 27 to 39 degrees (32 tosses): what they do at an impact seems to depend on where they
-are more than on these numbers.
+From such starts the model is 5 degrees off at the first impact, and in the 15 frames after it 48 other values of all
+six numbers gave a mean of 27 to 39 degrees (32 tosses): what the two links do at an impact seems to depend on where
+they are more than on these numbers.
 """
 
 import functools
