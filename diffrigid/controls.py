@@ -50,7 +50,7 @@ def as_controls(
             hint = nearest(unused[0], sizes) if sizes else "give Force or Torque a control."
             raise ValueError(f"controls: no force takes {', '.join(unused)}: {hint}")
 
-    of_forces = {name: numbers(f"controls[{name!r}]", controls[name], None) for name in sizes}
+    whole_controls = [given[name] for name in sizes]  # a list of numbers is one array
 
     def converted(path: Any, value: Any) -> Any:
         name = getattr(path[0], "key", None) if path else None
@@ -62,4 +62,7 @@ def as_controls(
             raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {whole}{ending}.")
         return array.reshape(*whole, *[1] * len(batch)) if name in sizes and not rest else array
 
-    return jax.tree_util.tree_map_with_path(converted, {**controls, **of_forces} if of_forces else controls)
+    def is_whole(node: Any) -> bool:
+        return any(node is one for one in whole_controls)
+
+    return jax.tree_util.tree_map_with_path(converted, controls, is_leaf=is_whole)

@@ -113,6 +113,9 @@ def best_launch(
         target: the one of `free` to learn, while the others are unknown too; default all of them (D-optimal).
 
     The gradient of the information is by central differences of exact Jacobians, all launches in one batch.
+
+    Raises:
+        ValueError: the target is not free, or what `expected_intervals` does not take.
     """
     plan = partial(_problem, world, state, planned=planned, free=free, noise=noise, observe=observe, dt=dt)
     scene = scene_of(plan([state]).runs[0])
