@@ -15,6 +15,7 @@ import dataclasses
 from typing import Any, dataclass_transform
 
 import jax
+import numpy as np
 
 replace = dataclasses.replace
 
@@ -42,14 +43,24 @@ def pytree(cls):
 
     The name of the class is a static field: JAX treats records of different classes with equal fields as equal, and
     `jit` may then run the program compiled for the other.
+
+    Two records are equal if all their fields and numbers are. As arrays, they do not hash.
     """
+    cls.__eq__, cls.__hash__ = _equal, None
     cls.__annotations__ = {**cls.__annotations__, "_class": str}
     cls._class = dataclasses.field(default=cls.__qualname__, repr=False, kw_only=True, metadata={"static": True})
-    cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    cls = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
     fields = dataclasses.fields(cls)
     meta = [f.name for f in fields if f.metadata.get("static")]
     data = [f.name for f in fields if f.name not in meta]
     return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=meta)
+
+
+def _equal(record, other) -> bool:
+    tree: Any = jax.tree.structure(record)
+    if type(record) is not type(other) or tree != jax.tree.structure(other):
+        return False
+    return all(map(np.array_equal, jax.tree.leaves(record), jax.tree.leaves(other)))
 
 
 def map_arrays(fn, node, where: str = "", stack: tuple[str, ...] = ()):

@@ -8,6 +8,7 @@ from jax import Array
 
 from diffrigid.paths import read
 from diffrigid.pytree import array, batch_rank, pytree
+from diffrigid.shapes import traced
 from diffrigid.state import State
 from diffrigid.world import World
 
@@ -36,6 +37,13 @@ class Trajectory:
                 f"jax.tree.map(lambda leaf: leaf[{path!r}], trajectory.state)"
             )
         return jax.vmap(lambda state: read(self.world, state, path))(self.state)
+
+    def __repr__(self) -> str:
+        """What it holds, and when; `state` and `world` print their numbers."""
+        when = f"t of shape {np.shape(self.t)}"
+        if isinstance(self.t, Array | np.ndarray) and not traced(self.t) and self.t.ndim == 1 and len(self.t):
+            when = f"{len(self.t)} times, {self.t[0]:.5g} to {self.t[-1]:.5g} s"
+        return f"Trajectory of {', '.join(self.world.names)}: {when}; state.x of shape {np.shape(self.state.x)}"
 
     def _repr_html_(self) -> str | None:
         """The motion itself, in a notebook; a batch is shown as text."""

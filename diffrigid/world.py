@@ -64,6 +64,12 @@ class World:
         """2 or 3."""
         return self.bodies.dim
 
+    def __repr__(self) -> str:
+        """A list of its parameters, with values and units."""
+        from diffrigid.paths import listing  # points down, so that a world prints itself
+
+        return listing(self)
+
 
 @pytree
 class Offset:

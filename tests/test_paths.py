@@ -211,3 +211,33 @@ def test_a_trajectory_asked_for_a_row_says_how_to_pick_it():
     alone = dr.Trajectory(t=np.zeros(1), state=state, world=world)
     with pytest.raises(ValueError, match=r"trajectory\[0\]: expected a path .* leaf\[0\], trajectory.state"):
         alone[0]
+
+
+def test_a_world_prints_its_parameters():
+    lines = repr(FLAT[0]).splitlines()
+    assert lines[0] == "World, 2D"
+    assert "rope (SpringDamper): anchor_a [0, 0] m, anchor_b [0.1, 0] m, stiffness 3 N/m" in "\n".join(lines)
+    assert "cue (Disc): mass 1 kg, inertia 0.08 kg m^2, restitution 0.3, friction 0.2, radius 0.4 m" in lines
+    listed = {path for path in paths.catalogue(SOLID[0]) if "." in path} - {
+        f"{name}.{field}" for name in SOLID[0].names for field in ("x", "q", "v", "w", "density")
+    }
+    shown = {line.split(" (")[0].split(":")[0]: line for line in repr(SOLID[0]).splitlines()[1:]}
+    for path in listed:
+        owner, _, field = path.partition(".")
+        assert f" {field.removeprefix('shape.')} " in shown[owner]
+
+
+@pytest.mark.parametrize("world", [FLAT[0], SOLID[0]], ids=["2D", "3D"])
+def test_a_world_prints_whatever_its_leaves_hold(world):
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 20, -1), world)
+    assert "mass of shape (20,)" in repr(batch)
+    for leaf in (None, 0.0, "a", jax.ShapeDtypeStruct((3,), float)):
+        assert repr(jax.tree.map(lambda _, leaf=leaf: leaf, world)).startswith("World")
+    jax.make_jaxpr(lambda world: repr(world) and world)(world)
+
+
+def test_worlds_with_equal_numbers_are_equal():
+    world, state = FLAT
+    assert world == jax.tree.map(jnp.copy, world) and state == dr.replace(state) and world != state
+    assert world != paths.write(world, state, "ball.mass", 1.3)[0]
+    assert world != dr.replace(world, names=("a", "b", "c"))
