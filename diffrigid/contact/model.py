@@ -99,31 +99,28 @@ class Contact:
         if not ends(world)["a"]:
             return state_at(launch(state, t0), dt)
         start = with_tangents(Anchors(state=state, t0=t0, since=t0 - dt[None]), (world, dt))
-        passes = functools.partial(self._passes, world, launch=launch, dt=dt)
+
+        def passes(start: Anchors, done: Array | None = None) -> Anchors:
+            return self._passes(world, start, done, launch, dt)
+
+        def end(anchors: Anchors) -> State:
+            return state_at(launch(anchors.state, anchors.t0), dt)
+
         if goes_in_rounds(world):  # among so many pairs some is always near, and times are found fast
-            end = passes(start)
-        else:
-            near = may_meet(world, launch(state, t0), dt)
-            end = lax.cond(near, passes, lambda start: start, start)
-        return state_at(launch(end.state, end.t0), dt)
+            start, done = isolated_impacts(world, start, launch, dt, self.sweeps)
+            # Each branch has its end: for one behind both, reverse mode would run the passes twice.
+            others, none = map(jax.checkpoint, (lambda *of: end(passes(*of)), lambda start, _: end(start)))
+            return lax.cond(done < self.sweeps, others, none, start, done)
+        near = may_meet(world, launch(state, t0), dt)
+        return end(lax.cond(near, passes, lambda start: start, start))
 
-    def _passes(self, world: "World", start: Anchors, launch: Callable, dt: Array) -> Anchors:
-        """The anchors after all passes."""
-        if not goes_in_rounds(world):
-            return self._any_passes(world, start, None, launch, dt)
-        start, done = isolated_impacts(world, start, launch, dt, self.sweeps)
-        others = functools.partial(self._any_passes, world, launch=launch, dt=dt)
-        return lax.cond(done < self.sweeps, jax.checkpoint(others), lambda start, _: start, start, done)
-
-    def _any_passes(self, world: "World", start: Anchors, done: Array | None, launch: Callable, dt: Array) -> Anchors:
+    def _passes(self, world: "World", start: Anchors, done: Array | None, launch: Callable, dt: Array) -> Anchors:
         """The anchors after passes over all contacts; so many impact passes are `done` already, None: none."""
         always = driven(world)  # acts in every step, without an impact before
         resting = jnp.broadcast_to(flags(always, start.t0), (len(always), *start.t0.shape[1:]))
-        # For reverse mode a pass is cheaper to recompute than to save, and compiles faster so, except for its searches
-        # (FOUND). After isolated impacts it is rarely needed, and these are not saved: they would mostly be zeros.
-        again = saving(*(FOUND,) * (done is None))
 
-        @again
+        # For reverse mode a pass is cheaper to recompute than to save, and compiles faster so, except for its searches.
+        @saving(FOUND)
         def one_pass(now, phase):
             return _pass(world, now, launch, dt, phase)
 
