@@ -1,7 +1,7 @@
 """What the data cannot determine, in words, and whether residuals look like noise."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,7 @@ class Coordinate:
     name: str
     path: str
     logarithmic: bool  # z is the logarithm of the parameter
+    bounded: bool  # on both sides
     scale: float  # a large change
 
 
@@ -41,12 +42,13 @@ def coordinates(slots: Sequence, references: Sequence[np.ndarray]) -> list[Coord
     """Coordinates of all numbers of z, in order."""
     out = []
     for slot, reference in zip(slots, references, strict=True):
-        log = isinstance(slot.kind, Free) and slot.kind.low == 0 and not np.isfinite(slot.kind.high)
+        bounded = isinstance(slot.kind, Free) and bool(np.isfinite(slot.kind.high))
+        log = isinstance(slot.kind, Free) and slot.kind.low == 0 and not bounded
         sizes = slot.kind.scale(reference)
         shape = np.shape(reference) if np.size(reference) == slot.size else (slot.size,)  # of charts: that of z
         for k, index in enumerate(np.ndindex(shape)):
             name = slot.name if slot.size == 1 else f"{slot.name}[{', '.join(map(str, index))}]"
-            out.append(Coordinate(name, slot.name, log, float(sizes[k])))
+            out.append(Coordinate(name, slot.name, log, bounded, float(sizes[k])))
     return out
 
 
@@ -136,13 +138,16 @@ def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
     return f"these change together without effect: {changes}"
 
 
-def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate]) -> list[str]:
-    """Notes on shared parameters that the data barely determine."""
+def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate], ended: Collection[str] = ()) -> list[str]:
+    """Notes on shared parameters that the data barely determine, but for those that ended at a bound."""
     notes = []
     for c, s in zip(coordinates, np.sqrt(np.diag(covariance)), strict=True):
-        if LARGE * c.scale < s < np.inf:
-            factor = f"a factor {np.exp(s):.2g}" if s < ANY else "any factor"
-            notes.append(f"{c.name} is hardly seen: known to {factor if c.logarithmic else f'+- {s:.2g}'}")
+        if not LARGE * c.scale < s < np.inf or c.path in ended:
+            continue
+        factor = f"a factor {np.exp(s):.2g}" if s < ANY else "any factor"
+        known = f"known to {factor if c.logarithmic else f'+- {s:.2g}'}"
+        words = "its interval is as wide as its bounds let it be" if c.bounded else known
+        notes.append(f"{c.name} is hardly seen: {words}")
     return notes
 
 

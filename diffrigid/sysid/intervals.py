@@ -27,7 +27,7 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
 from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
-from diffrigid.sysid.table import BLIND
+from diffrigid.sysid.table import BLIND, BOUND
 from diffrigid.world import World
 
 UNSEEN = 1e-6  # [-] part of a slope along undetermined directions: more is not rounding
@@ -41,7 +41,8 @@ def describe(
     """Parameters with intervals, and the notes under the table."""
     blind = blind_directions(linear, coordinates_of(problem))
     parameters = tuple(_parameters(problem, shared, own, linear, uncertainty, blind))
-    return parameters, tuple(_notes(problem, linear, uncertainty, blind, residuals, loss))
+    ended = [p.name for p in parameters if p.note == BOUND]
+    return parameters, tuple(_notes(problem, linear, uncertainty, blind, ended, residuals, loss))
 
 
 def _parameters(
@@ -66,7 +67,7 @@ def _parameters(
 
 
 def _notes(
-    problem: Problem, linear: Linear, uncertainty: Uncertainty, blind: Sequence[Blind],
+    problem: Problem, linear: Linear, uncertainty: Uncertainty, blind: Sequence[Blind], ended: Sequence[str],
     residuals: tuple[dict[str, np.ndarray], ...], loss: Any,
 ) -> list[str]:  # fmt: skip
     """What the data cannot determine, and why not to believe the intervals."""
@@ -74,7 +75,12 @@ def _notes(
     if uncertainty.freedom < linear.shared:
         degrees = "1 degree" if round(uncertainty.freedom) == 1 else f"{uncertainty.freedom:.0f} degrees"
         notes.append(f"{degrees} of freedom for {linear.shared} intervals: fit more records")
-    notes += weak(infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared)), places)
+    notes += weak(infinite_where_blind(uncertainty.covariance, blind, slice(0, linear.shared)), places, ended)
+    if ended:
+        notes.append(
+            f"{', '.join(ended)} ended at a bound, where the interval in the table says little: widen interval(low, "
+            "high) if values beyond it are possible; if not, dr.profile gives an interval that ends there"
+        )
     notes += _together(uncertainty.covariance, places, blind)
     series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]
     series = [r for r in series if np.isfinite(r).any()]
@@ -97,7 +103,7 @@ def number_names(problem: Problem) -> list[str]:
 def _note(slot: Slot, value: np.ndarray, blind: Sequence[Blind]) -> str:
     if any(slot.name in b.names for b in blind):
         return BLIND
-    return "at its bound" if slot.kind.at_bound(value) else ""
+    return BOUND if slot.kind.at_bound(value) else ""
 
 
 def unseen_of(blind: Sequence[Blind], rows: slice) -> np.ndarray:

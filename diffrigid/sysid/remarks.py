@@ -13,7 +13,7 @@ from diffrigid.paths import catalogue, component, read, write
 from diffrigid.shapes import Disc, Sphere
 from diffrigid.state import rotations
 from diffrigid.sysid.covariance import Linear
-from diffrigid.sysid.diagnosis import RARE, whiteness
+from diffrigid.sysid.diagnosis import LARGE, RARE, whiteness
 from diffrigid.sysid.levenberg import Point, point_at
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Scene, pieces
@@ -46,11 +46,14 @@ def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[di
 
 
 def sticking(problem: Problem, point: Point, best: int, linear: Linear, covariance: np.ndarray) -> list[str]:
-    """Remarks on frictions that ended where what slipped begins to stick, so that larger ones fit as well."""
+    """Remarks on frictions that ended where what slipped begins to stick, so that larger ones fit as well.
+
+    Not on those that are hardly seen, as at a bound: a little above them is then no longer near them.
+    """
     information, out = sum((slopes**2).sum(0) for slopes in linear.slopes), []
     for slot, rows in pieces(problem.shared):
         one = rows.start
-        if not component(slot.paths[0])[0].endswith("friction") or not 0 < covariance[one, one] < np.inf:
+        if not component(slot.paths[0])[0].endswith("friction") or not 0 < covariance[one, one] < LARGE**2:
             continue
         z = jax.tree.map(lambda leaf: jnp.repeat(leaf[..., best : best + 1], leaf.shape[-1], -1), point.z)
         above = z._replace(shared=z.shared.at[one].add(2.0 * np.sqrt(covariance[one, one])))

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
 BLIND = "not determined, see below"  # note of a parameter with a number that has no interval
+BOUND = "at its bound"  # note of a parameter that ended there
 SHOWN = 3  # records whose own numbers are in the table
 
 
