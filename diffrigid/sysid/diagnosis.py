@@ -1,7 +1,7 @@
 """What the data cannot determine, in words, and whether residuals look like noise."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ SMALL = 0.05  # [-] parts of a direction below this share of its largest are rou
 LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that hardly determines it
 RARE = 1e-3  # chance below which residuals are not taken for noise
 LAGS = 5  # largest lag of the autocorrelation of residuals
+TOO_LARGE, TOO_SMALL = 1.2, 0.5  # [-] of the noise that was given: residuals beyond these are reported
 ANY = 20.0  # standard deviation of a logarithm beyond which the factor is not quoted
 
 
@@ -188,13 +189,12 @@ def normality(r: np.ndarray) -> float:
     return float(np.exp(-0.5 * statistic))  # chi^2 with two degrees of freedom
 
 
-def doubts(series: Sequence[np.ndarray], expected: float | None, robust: bool = False) -> list[str]:
+def doubts(series: Sequence[np.ndarray], robust: bool = False) -> list[str]:
     """Reasons to doubt intervals that take residuals as independent normal noise; empty if there are none.
 
     Args:
         series: residuals in standard deviations, one array a component of a column, in order of time.
-        expected: mean square that they should have; None if the noise was estimated from them.
-        robust: whether the loss already gives the tails less weight.
+        robust: do not ask whether they are normal: the loss gives the tails less weight, or units are in doubt.
     """
     out = []
     if (p := whiteness(series)) < RARE:
@@ -205,9 +205,24 @@ def doubts(series: Sequence[np.ndarray], expected: float | None, robust: bool = 
     joined = np.concatenate([r[np.isfinite(r)] for r in series])
     if not robust and (p := normality(joined)) < RARE:
         out.append(f"residuals are not normal (p = {p:.1g}): huber() or student() would give the tails less weight")
-    if expected is not None and len(joined) and (ratio := float(np.sqrt(np.mean(joined**2) / expected))) > 1.2:
-        out.append(f"residuals are {ratio:.2g} times the noise that was given")
     return out
+
+
+def misjudged(columns: Mapping[str, np.ndarray], expected: float) -> list[str]:
+    """Remark on columns whose residuals are not as large as the noise that was given for them.
+
+    A mean square of n residuals varies by sqrt(2 / n): what three times that explains is not reported.
+
+    Args:
+        columns: residuals of each by its name, in standard deviations as given.
+        expected: mean square that they should have.
+    """
+    words = []
+    for name, r in columns.items():
+        square, chance = float(np.mean(r**2)) / expected, 3.0 * np.sqrt(2.0 / len(r))
+        if square > max(TOO_LARGE**2, 1.0 + chance) or square < min(TOO_SMALL**2, 1.0 - chance):
+            words.append(f"{np.sqrt(square):.2g} times the noise that was given for {name}")
+    return [f"residuals are {', '.join(words)}"] if words else []
 
 
 def infinite_where_blind(covariance: np.ndarray, blind: Sequence[Blind], numbers: slice) -> np.ndarray:

@@ -20,6 +20,7 @@ from diffrigid.sysid.diagnosis import (
     correlations,
     doubts,
     infinite_where_blind,
+    misjudged,
     weak,
 )
 from diffrigid.sysid.free import Free
@@ -84,10 +85,15 @@ def _notes(
     notes += _together(uncertainty.covariance, places, blind)
     series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]
     series = [r for r in series if np.isfinite(r).any()]
-    given = all(name in run.noise for run in problem.runs for name in run.channels)
     lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
     count = sum(map(len, linear.rows))
-    return notes + doubts(series, max(1.0 - lost / count, 0.05) if given else None, not isinstance(loss, Squares))
+    given: dict[str, list[np.ndarray]] = {}
+    for run, record in zip(problem.runs, residuals, strict=True):
+        for name in run.noise:
+            given.setdefault(name, []).append(record[name][np.isfinite(record[name])])
+    columns = {name: r for name, parts in given.items() if len(r := np.concatenate(parts))}
+    wrong = misjudged(columns, max(1.0 - lost / count, 0.05))  # then columns together are not normal in any case
+    return notes + wrong + doubts(series, bool(wrong) or not isinstance(loss, Squares))
 
 
 def coordinates_of(problem: Problem) -> list[Coordinate]:
