@@ -72,14 +72,14 @@ class Force:
     """A force at a point fixed to a body; with `control`, plus what `controls[control]` holds, (D, *batch) [N].
 
     Example:
-        >>> made, start = dr.scene({"ball": ball}, forces=[dr.Force(body="ball", F=(0.0, 0.0), control="push")])
+        >>> made, start = dr.scene({"ball": ball}, forces=[dr.Force("ball", control="push")])
         >>> push = jnp.array([[1.0, 0.0], [0.0, 0.0]])  # (T, D) [N] held over a step
         >>> dr.rollout(made, start, dt=0.5, steps=2, controls={"push": push}).state.v[:, 0, 0].tolist()
         [0.0, 0.5, 0.5]
     """
 
     body: str = static(kw_only=False)
-    F: Leaf = array("D")  # (D, *batch) [N] world axes
+    F: Leaf = array("D", default=0.0)  # (D, *batch) [N] world axes
     point: Leaf = array("D", default=None)  # (D, *batch) [m] body axes; None: the centre of mass
     control: str | None = static(default=None)
     uniform: ClassVar[bool] = False
@@ -113,7 +113,7 @@ class Torque:
     """
 
     body: str = static(kw_only=False)
-    tau: Leaf = array("A")  # (A, *batch) [N m] world axes
+    tau: Leaf = array("A", default=0.0)  # (A, *batch) [N m] world axes
     control: str | None = static(default=None)
     constant: ClassVar[bool] = True  # controls are held over a step
     uniform: ClassVar[bool] = False

@@ -17,7 +17,7 @@ T = np.arange(21) / 20
 
 def puck(mass=1.0, speed=0.0):
     body = dr.Body(None, mass=mass, inertia=1.0, x=(0.0, 0.0), v=(speed, 0.0))
-    return dr.scene({"p": body}, forces=[dr.Force(body="p", F=(0.0, 0.0), control="push")])
+    return dr.scene({"p": body}, forces=[dr.Force(body="p", control="push")])
 
 
 def place(t):
