@@ -73,7 +73,10 @@ def rollout_batch(
     length, steps, memory = step_length(dt, state), at_least_one("steps", steps), at_least_one("memory", memory)
     sizes = {size for tree in (world, state) for size in _batch_sizes(tree)}
     if len(sizes) != 1:
-        raise ValueError(f"rollout_batch: expected one leading batch axis on some leaf, got lengths {sorted(sizes)}")
+        raise ValueError(
+            f"rollout_batch: expected one leading batch axis on some leaf, got lengths {sorted(sizes)}"
+            + ("" if sizes else ": make one by jax.vmap of dr.paths.write, or use rollout for one world")
+        )
     count, most = sizes.pop(), _chunk(world) if chunk is None else at_least_one("chunk", chunk)
     controls = _controls(world, controls, state.x.dtype, steps, count)
     if chunk is None:

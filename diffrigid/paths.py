@@ -294,7 +294,10 @@ def _set(record: Any, field: str, place: Place, path: str, value: Any) -> Array:
     if value.ndim == 0 and expected == (1,):
         value = value[None]
     if value.shape not in (expected, expected + batch):
-        raise ValueError(f"{path} was given the shape {value.shape}: expected {expected}, as `read` returns it.")
+        many = ""
+        if value.shape[1:] == expected:
+            many = f" For many worlds: jax.vmap(lambda value: dr.paths.write(world, state, {path!r}, value))(values)"
+        raise ValueError(f"{path} was given the shape {value.shape}: expected {expected}, as `read` returns it.{many}")
     value = known(so2.exp, value[None]) if place.angle else value
     value = value.reshape(value.shape + (1,) * (leaf.ndim - (place.row is not None) - value.ndim))
     return _with_rows(leaf, ... if place.row is None else place.row, value)

@@ -105,7 +105,7 @@ def test_gradient_of_a_batch_is_that_of_each_world():
 
 def test_bad_batches(many):
     world, state, _, states, _, _ = many
-    with pytest.raises(ValueError, match="one leading batch axis"):
+    with pytest.raises(ValueError, match="one leading batch axis.*or use rollout for one world"):
         dr.rollout_batch(world, state, dt=1 / 60, steps=3)
     with pytest.raises(ValueError, match="one leading batch axis"):
         dr.rollout_batch(world, dr.replace(states, x=jnp.zeros((3, 2, 2))), dt=1 / 60, steps=3)
