@@ -17,6 +17,7 @@ from diffrigid.batch import rollout_batch
 from diffrigid.compiling import QUICK, compile_for_speed
 from diffrigid.contact import Contact
 from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
+from diffrigid.gap import gap
 from diffrigid.impacts import contacts
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.models import load_mjcf, load_urdf
@@ -109,6 +110,7 @@ __all__ = [
     "each",
     "explore",
     "fit",
+    "gap",
     "huber",
     "inertia",
     "interval",

@@ -143,3 +143,49 @@ def test_a_body_of_many_worlds_meets_one_that_all_share(dim, kind_a, kind_b):
     for x_a, x_b in ((many, x), (x, many)):
         contacts = jax.eval_shape(COLLIDERS[kind_a, kind_b], a, x_a, q, b, x_b, q)
         assert contacts.gap.shape[1:] == (5,)
+
+
+@pytest.mark.parametrize("names", [("tile", "box"), ("floor", "tile"), ("box", "post")])
+def test_the_gap_of_two_bodies_is_their_distance_wherever_the_shape_sits(names):
+    """A polygon whose origin is not its centre of mass; in either order, by `jit`, with its derivative by the poses."""
+    bodies = {
+        "tile": dr.Body(SHAPES[2][dr.Polygon], mass=1.0, x=(0.0, 2.0), angle=0.4),
+        "box": dr.Body(SHAPES[2][dr.Box], mass=1.0, x=(1.9, 2.5), angle=1.0),
+        "floor": dr.Static(dr.HalfSpace(normal=(0.6, 0.8)), x=(0.2, 0.1), angle=0.2),
+        "post": dr.Static(SHAPES[2][dr.Capsule], x=(0.5, 4.0), angle=0.3),
+    }
+    world, state = dr.scene(bodies)
+
+    def of(name):
+        shape, centre = bodies[name].shape, np.zeros(2)
+        if name in world.names:
+            k = world.names.index(name)
+            (offset,) = (o for o, owners in zip(world.offsets, world.owners, strict=True) if k in owners)
+            centre = centre if offset is None else -np.asarray(offset.r[0])
+            return place(shape, np.asarray(state.x[k]), np.asarray(state.q[k]), centre)
+        k = world.static_names.index(name)
+        return place(shape, np.asarray(world.statics.x[k]), np.asarray(world.statics.q[k]), centre)
+
+    found, slope = jax.jit(jax.value_and_grad(lambda state: dr.gap(world, state, *names)))(state)
+    assert_allclose(found, separation(of(names[0]), of(names[1])), atol=ROUNDING)
+    assert_allclose(dr.gap(world, state, *names[::-1]), found, atol=ROUNDING)
+    moves = np.linalg.norm(np.asarray(slope.x), axis=1)  # by one along the normal
+    assert_allclose(moves[[world.names.index(name) for name in names if name in world.names]], 1.0, atol=1e-9)
+
+
+def test_a_gap_that_is_not_there_is_refused():
+    world, state = dr.scene(
+        {
+            "ball": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(1.0, 1.0)),
+            "dot": dr.Body(None, mass=1.0, inertia=1.0, x=(1.0, 2.0)),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+            "wall": dr.Static(dr.HalfSpace(normal=(1.0, 0.0))),
+        }
+    )
+    for names, why in (
+        (("ball", "flor"), "did you mean 'floor'"),
+        (("ball", "dot"), "no shape"),
+        (("floor", "wall"), "neither"),
+    ):
+        with pytest.raises(ValueError, match=f"gap: .*{why}"):
+            dr.gap(world, state, *names)
