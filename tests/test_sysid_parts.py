@@ -105,6 +105,25 @@ def test_a_table_hides_no_single_record():
     assert names(3) == ["a{0}", "a{1}", "a{2}"] and names(4) == [*names(3), "a{3}"] and names(5) == [*names(3), "a"]
 
 
+def test_rows_are_all_numbers_unrounded_and_one_prints_as_in_the_table():
+    own = np.arange(10.0).reshape(5, 2) + 1.0 / 3.0
+    speeds = Parameter("a.v", own, own - 1.0, own + np.pi, "m/s", "", 5)
+    bounce = Parameter("restitution", *(np.asarray(end) for end in (0.75, 0.7, 0.80001)), "", "at its bound")
+    rows = Summary((bounce, speeds), {}, np.zeros(1), 1, (), (), 0, 1.0, {}).rows()
+    assert len(rows) == 11  # of all records, also those that the table hides
+    assert rows[0] == dict(parameter="restitution", value=0.75, low=0.7, high=0.80001, unit="", note="at its bound")
+    assert (rows[-1]["parameter"], rows[-1]["value"], rows[-1]["high"]) == ("a.v{4}[1]", own[4, 1], own[4, 1] + np.pi)
+    assert repr(bounce).splitlines()[2].split() == [
+        "restitution",
+        "0.75",
+        "0.7",
+        "..",
+        "0.8",
+        "-",
+        *"at its bound".split(),
+    ]
+
+
 def test_a_posterior_of_a_component_prints_its_table():
     parameter = Parameter("a.v[1]", *(np.asarray(end) for end in (1.0, 0.9, 1.1)), "m/s", "")
     fit = Summary((parameter,), {}, np.zeros(1), 1, (), (), 0, 1.0, {})

@@ -221,6 +221,15 @@ class Fit:
         summary = replace(self.summary, parameters=parameters, notes=(*self.remarks, *notes))
         return replace(self, summary=summary, uncertainty=uncertainty)
 
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of the table, a dictionary for each number: parameter, value, low, high, unit, note; unrounded.
+
+        Example:
+            >>> [(row["parameter"], row["unit"]) for row in found.rows()]  # pandas.DataFrame(found.rows()).to_latex()
+            [('restitution', '')]
+        """
+        return self.summary.rows()
+
     def save(self, path: str | Path) -> Path:
         """Write what is in the table, with versions and seed, as JSON."""
         return self.summary.save(path)

@@ -13,7 +13,8 @@ import numpy as np
 
 from diffrigid.paths import component
 from diffrigid.sysid.orders import Orders
-from diffrigid.sysid.table import html_table, text_table
+from diffrigid.sysid.table import HEADER, html_table, numbers, rows_of, text_table
+from diffrigid.tables import lined_up
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,9 @@ class Parameter:
     unit: str
     note: str  # "" or why not to trust it
     records: int = 0
+
+    def __repr__(self) -> str:
+        return "\n".join(lined_up(HEADER, rows_of(self)))
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,10 @@ class Summary:
 
     def _repr_html_(self) -> str:
         return html_table(self)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of the table, a dictionary for each number: parameter, value, low, high, unit, note; unrounded."""
+        return numbers(self)
 
     def save(self, path: str | Path) -> Path:
         """Write a JSON file, which `load_fit` reads; numbers that are not finite as "inf" and "nan"."""

@@ -27,18 +27,34 @@ def rows_of(p: Any) -> list[tuple[str, ...]]:
     out: list[tuple[str, ...]] = []
     shown = p.records if p.records <= SHOWN + 1 else SHOWN  # a line that hides one record saves none
     for index in np.ndindex(p.value.shape):
-        record, part = (index[:1], index[1:]) if p.records else ((), index)
-        if record and record[0] >= shown:
+        if p.records and index[0] >= shown:
             continue
-        name = p.name + "".join(f"{{{k}}}" for k in record) + (f"[{', '.join(map(str, part))}]" if part else "")
-        value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
+        name, value, low, high, unit, note = _number(p, index)
         places = digits(value, low, high, 3)
         interval = f"{low:.{places}g} .. {high:.{places}g}"
-        note = "" if p.note == BLIND and np.isfinite(low) and np.isfinite(high) else p.note
-        out.append((name, f"{value:.{places}g}", interval, p.unit or "-", note))
+        out.append((name, f"{value:.{places}g}", interval, unit or "-", note))
     if p.records > shown:
         out.append((p.name, "...", "", "", f"and {p.records - shown} more records"))
     return out
+
+
+def _number(p: Any, index: tuple[int, ...]) -> tuple[str, float, float, float, str, str]:
+    """Name, value, ends of the interval, unit and note of one number of a parameter."""
+    record, part = (index[:1], index[1:]) if p.records else ((), index)
+    name = p.name + "".join(f"{{{k}}}" for k in record) + (f"[{', '.join(map(str, part))}]" if part else "")
+    value, low, high = float(p.value[index]), float(p.low[index]), float(p.high[index])
+    note = "" if p.note == BLIND and np.isfinite(low) and np.isfinite(high) else p.note
+    return name, value, low, high, p.unit, note
+
+
+def numbers(summary: "Summary") -> list[dict[str, Any]]:
+    """Every number, those of all records too, unrounded: a dictionary of parameter, value, low, high, unit, note."""
+    names = ("parameter", "value", "low", "high", "unit", "note")
+    return [
+        dict(zip(names, _number(p, index), strict=True))
+        for p in summary.parameters
+        for index in np.ndindex(p.value.shape)
+    ]
 
 
 def below(summary: "Summary") -> list[str]:
