@@ -30,11 +30,19 @@ class Trajectory:
     controls: Any = None  # as given, over each interval
 
     def __getitem__(self, path: str) -> Array:
-        """Value of a path at every time, (T+1, ...); see `diffrigid.paths`."""
+        """Value of a path at every time, (T+1, ...), or (B, T+1, ...) by `vmap` of `rollout`; see `diffrigid.paths`."""
         if not isinstance(path, str):
             raise ValueError(
                 f"trajectory[{path!r}]: expected a path such as 'ball.x'; of states pick a time by "
                 f"jax.tree.map(lambda leaf: leaf[{path!r}], trajectory.state)"
+            )
+        if np.ndim(self.t) > 1:  # then every leaf has that axis, of the world too
+            return jax.vmap(lambda one: one[path])(self)
+        shape, expected = np.shape(self.state.x)[:3], (len(self.t), len(self.world.names), self.world.dim)
+        if shape != expected:
+            raise ValueError(
+                f"trajectory[{path!r}]: state.x begins with the axes {shape}, expected (T+1, N, D) = {expected}; of "
+                f"many worlds: jax.vmap(lambda states: dr.Trajectory(t=t, state=states, world=world)[{path!r}])(states)"
             )
         return jax.vmap(lambda state: read(self.world, state, path))(self.state)
 

@@ -103,6 +103,24 @@ def test_gradient_of_a_batch_is_that_of_each_world():
     assert_allclose(jax.jit(jax.grad(total))(v), np.stack([one(w) for w in v]), atol=1e-9)
 
 
+def test_a_trajectory_of_many_worlds_is_read_by_path_in_each():
+    """By `vmap` of `rollout`; states of `rollout_batch` have no times of their own, and are refused."""
+    bodies = {name: dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(x, 1.0)) for name, x in (("a", 0.0), ("b", 3.0))}
+    world, state = dr.scene(bodies)
+    speed, dt = np.arange(3.0), 0.1
+    heavier = jax.vmap(lambda m: dr.paths.write(world, state, "b.mass", m)[0])(1.0 + speed)
+    moving = jax.vmap(lambda v: dr.replace(state, v=jnp.ones((2, 2)) * v))(speed)
+    runs = jax.vmap(lambda world, state: dr.rollout(world, state, dt=dt, steps=4))(heavier, moving)
+    expected = 3.0 + speed[:, None] * dt * np.arange(5)
+    assert_allclose(runs["b.x[0]"], expected, atol=1e-12)
+    assert_allclose(runs["b.mass"], np.repeat(1.0 + speed[:, None], 5, axis=1))
+    states = dr.rollout_batch(world, moving, dt=dt, steps=4)
+    run = dr.Trajectory(t=jnp.asarray(dt * np.arange(5)), state=states, world=world)
+    with pytest.raises(ValueError, match=r"state.x begins with the axes \(3, 5, 2\), expected .* \(5, 2, 2\); .*vmap"):
+        run["b.x"]
+    assert_allclose(jax.vmap(lambda states: dr.replace(run, state=states)["b.x[0]"])(states), expected, atol=1e-12)
+
+
 def test_bad_batches(many):
     world, state, _, states, _, _ = many
     with pytest.raises(ValueError, match="one leading batch axis.*or use rollout for one world"):
