@@ -166,6 +166,9 @@ class Function:
 class Channel:
     """One column: what it observes, and its instrument.
 
+    It reads scale times what is observed, plus `bias`. `clock` [s] is how far its clock is ahead: at its time t it sees
+    the motion at t - clock. Each can be fitted, whether the column was given as a `Channel` or not: "COLUMN.clock".
+
     Example:
         >>> tip = dr.Channel(dr.Marker("ball", point=(0.1, 0.0)), clock=0.02)
         >>> columns, late = {"t": measured["t"], "tip": measured["ball.x"]}, {"tip.clock": dr.real()}
