@@ -195,6 +195,19 @@ def test_a_file_as_spreadsheets_write_it(tmp_path):
         read_csv(tmp_path / "lost.csv")
 
 
+def test_columns_that_are_none_of_the_fit_are_left_out(tmp_path):
+    """Numbers of rows and remarks, as a logger writes them; other records may lack them, and a component may go too."""
+    (tmp_path / "gates.csv").write_text("gate;t;cue.x[0];remark\nA;0,5;1,5;late\nB;1;2,5;\n")
+    unread = {"gate": None, "remark": None}
+    for data in (tmp_path / "gates.csv", {"gate": ["A", "B"], "t": [0.5, 1.0], "cue.x[0]": [1.5, 2.5]}):
+        (x,), *_ = columns(WORLD, data, unread)
+        assert_array_equal(x.values[:, 0], [1.5, 2.5])
+    (x,), *_ = columns(WORLD, {"t": T, "cue.x[0]": T, "cue.x[1]": T}, {"cue.x[1]": None})
+    assert np.isnan(x.values[:, 1]).all()
+    with pytest.raises(ValueError, match="no column 'gate' in this 2D world.*None leaves it out"):
+        columns(WORLD, {"t": T, "gate": T}, {})
+
+
 def test_columns_may_have_times_of_their_own():
     slow = T[::2] + 0.03
     series, *_ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})

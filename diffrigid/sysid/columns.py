@@ -1,7 +1,7 @@
 """Measured columns by name, from a dictionary, a table or a CSV file, checked."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,10 +35,11 @@ def columns(
         observations: a mapping or a table (anything with `columns`), or the path of a CSV file. "t" (K,) [s], and by
             name (K,) or (K, size), NaN where missing; or a pair (t, values) for a column with times of its own. A
             component stands alone as "ball.x[0]".
-        observe: what a column observes if it is not named for that.
+        observe: what a column observes if it is not named for that; None: it is left out.
     """
-    table = _table(observations, where)
     check_mapping("observe", observe)
+    left_out = {name for name, what in observe.items() if what is None}
+    table = {name: values for name, values in _table(observations, where, left_out).items() if name not in left_out}
     if odd := [name for name in table if not isinstance(name, str)]:
         raise ValueError(f"{where} has a column {odd[0]!r}: expected names of columns, such as 'ball.x'")
     shared = None if "t" not in table else _times(table.pop("t"), f'{where}["t"]')
@@ -62,7 +63,7 @@ def columns(
         values = _filled(values, len(t), channel.bias.shape[0], name, where, world)
         found.append(Series(name, t, values))
         channels[name] = channel
-    if unused := set(observe) - set(gathered):
+    if unused := set(observe) - set(gathered) - left_out:
         raise ValueError(f"observe: no column {sorted(unused)[0]!r} in {where}, there are {sorted(gathered)}")
     if not found:
         raise ValueError(f"{where}: nothing is measured: expected a column beside the times")
@@ -70,8 +71,10 @@ def columns(
     return tuple(found), channels, tuple(controls)
 
 
-def read_csv(path: str | Path) -> dict[str, np.ndarray]:
+def read_csv(path: str | Path, left_out: Collection[str] = ()) -> dict[str, np.ndarray]:
     """Read the columns of a file with one line of names; an empty cell is a missing value.
+
+    Those that are `left_out` may hold anything.
 
     Between columns are commas, or semicolons or tabs where the names have these; numbers may then have decimal commas.
     """
@@ -89,20 +92,22 @@ def read_csv(path: str | Path) -> dict[str, np.ndarray]:
         if len(row) != len(names):
             raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)}, one for each name")
         for name, cell in zip(names, row, strict=True):
-            if cell.strip() and not _is_number(cell.replace(",", ".") if mark != "," else cell):
+            wanted = name not in left_out and cell.strip()
+            if wanted and not _is_number(cell.replace(",", ".") if mark != "," else cell):
                 raise ValueError(
                     f"{path}, row {number}, column {name!r} is {cell!r}: expected numbers under one line of names, "
                     "empty where missing"
                 )
     if mark != ",":
         body = [[cell.replace(",", ".") for cell in row] for row in body]
-    cells = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in body])
-    return {name: cells[:, k] for k, name in enumerate(names)} if len(body) else {name: np.zeros(0) for name in names}
+    kept = [k for k, name in enumerate(names) if name not in left_out]
+    cells = np.array([[float(row[k]) if row[k].strip() else np.nan for k in kept] for row in body])
+    return {names[k]: cells[:, j] if len(body) else np.zeros(0) for j, k in enumerate(kept)}
 
 
-def _table(observations: Any, where: str) -> dict[str, Any]:
+def _table(observations: Any, where: str, left_out: Collection[str]) -> dict[str, Any]:
     if isinstance(observations, str | Path):
-        return dict(read_csv(observations))
+        return dict(read_csv(observations, left_out))
     if hasattr(observations, "columns"):
         return {str(name): np.asarray(observations[name]) for name in observations.columns}
     if not isinstance(observations, Mapping):

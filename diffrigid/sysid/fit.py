@@ -64,7 +64,8 @@ def fit(
             touch, have joints, or forces vary.
         noise: standard deviation of each column, in its unit, a number or an array like the column; what is not given
             is estimated from the residuals.
-        observe: what a column observes if its name does not say so: {"tip": Marker("rod", point=(0.3, 0))}.
+        observe: what a column observes if its name does not say so: {"tip": Marker("rod", point=(0.3, 0))};
+            None leaves it out.
         widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets
             starts that miss an impact find it. Default: that of the world, 0 unless it was given another.
         windows: [s] of each record from its start, one fit after the other: (0.5, 1, 2, inf) leads into a long one.
