@@ -264,13 +264,16 @@ def test_a_mass_that_leaves_the_inertia_of_a_solid_body_is_noticed(free):
         assert [note for note in found.notes if note.startswith("box.mass is 2 times what it was, box.inertia is as")]
 
 
-def test_degrees_in_a_column_of_angles_are_noticed():
+def test_degrees_in_a_column_of_angles_are_noticed_and_so_is_data_without_noise():
     wheel = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 0.0), w=1.0)
     t = np.arange(60) / 30
     found = dr.fit(
         *dr.scene({"wheel": wheel}), {"t": t, "wheel.angle": np.degrees(2.0 * t)}, free={"wheel.w": dr.real()}
     )
     assert found.notes[0].startswith("the fit failed") and "degrees" in found.notes[0]
+    exact = dr.fit(*dr.scene({"wheel": wheel}), {"t": t, "wheel.angle": 2.0 * t}, free={"wheel.w": dr.real()})
+    (note,) = exact.notes  # rounding is neither white nor normal, which says nothing of the model
+    assert note.startswith("residuals of wheel.angle are rounding")
 
 
 def test_times_in_milliseconds_are_doubted_before_the_fit():

@@ -26,7 +26,7 @@ from diffrigid.sysid.diagnosis import (
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
-from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
+from diffrigid.sysid.setup import LEAST, Problem, first_value, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import BLIND, BOUND
 from diffrigid.world import World
@@ -83,8 +83,12 @@ def _notes(
             "high) if values beyond it are possible; if not, dr.profile gives an interval that ends there"
         )
     notes += _together(uncertainty.covariance, places, blind)
-    series = [column[:, k] for record in residuals for column in record.values() for k in range(column.shape[1])]
-    series = [r for r in series if np.isfinite(r).any()]
+    exact = [name for name, sigma in problem.noise.items() if sigma <= LEAST]
+    if exact:
+        names = ", ".join(exact)
+        notes.append(f"residuals of {names} are rounding, as of simulated data without noise: intervals mean nothing")
+    tested = [column for record in residuals for name, column in record.items() if name not in exact]
+    series = [r for column in tested for r in column.T if np.isfinite(r).any()]
     lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
     count = sum(map(len, linear.rows))
     given: dict[str, list[np.ndarray]] = {}
