@@ -22,6 +22,7 @@ from diffrigid.impacts import contacts
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.models import load_mjcf, load_urdf
 from diffrigid.pytree import replace
+from diffrigid.saved_scene import load_scene, save_scene
 from diffrigid.scene import Body, Static, scene
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Hull, Polygon, Profile, Sphere
 from diffrigid.state import (
@@ -117,6 +118,7 @@ __all__ = [
     "kinetic_energy",
     "load_fit",
     "load_mjcf",
+    "load_scene",
     "load_urdf",
     "material_point",
     "material_velocity",
@@ -133,6 +135,7 @@ __all__ = [
     "rotation",
     "sample",
     "sandwich",
+    "save_scene",
     "scene",
     "segments",
     "shares",

@@ -36,6 +36,7 @@ from diffrigid.world import Statics, World
 
 TURNING = {"rolling_friction", "spinning_friction"}
 RESERVED = (*COEFFICIENTS, "contact")  # paths, or the first part of one; and "gravity"
+MOST = 1000  # sweeps, or neighbours
 
 
 @dataclass(frozen=True)
@@ -276,8 +277,8 @@ def _contact(contact: Any) -> Contact:
     refuse_missing(contact, "contact")
     for name in ("sweeps", "neighbours"):
         value = getattr(contact, name)
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"contact.{name} is {value!r}: expected an integer above 0; leave it out.")
+        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MOST:
+            raise ValueError(f"contact.{name} is {value!r}: expected an integer above 0, up to {MOST}; leave it out.")
 
     def check(leaf, letters, path):
         del letters

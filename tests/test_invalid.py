@@ -8,6 +8,7 @@ import os
 import warnings
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import jax
 import jax.numpy as jnp
@@ -307,6 +308,7 @@ FITS = {
     "student": (dr.student, (*POSITIVE, None)),
     "load_fit": (dr.load_fit, ("nowhere.json", None, 1.5, 0, "", ".", object(), {}, [])),
     "CSV": (lambda v: fitted(observations=v), ("nowhere.csv", "", ".", Path("nowhere"))),
+    "load_scene": (dr.load_scene, ("nowhere.json", None, 1.5, 0, "", ".", object(), {}, [])),
     "read_scene": (read_scene, ("nowhere.toml", None, 1.5, 10**6, "", ".", object(), {}, [])),
     "segments count": (lambda v: dr.segments(*pair(), DATA, v), INTEGER),
     "segments": (lambda v: dr.segments(*pair(), v, 2), (*RECORD, None)),
@@ -447,3 +449,9 @@ SAVED = {
     "noise": {"ball.x": 1e-3}, "costs": [1.0], "agree": 1, "orders": [], "notes": [], "seed": 0, "seconds": 1.0,
     "versions": {},
 }  # fmt: skip
+
+
+def saved_scene():
+    """What `save_scene` writes."""
+    with TemporaryDirectory() as where:
+        return dr.save_scene(Path(where, "scene.json"), *pair()).read_text()

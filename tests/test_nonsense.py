@@ -90,6 +90,7 @@ FILES = {
     "mjcf": (dr.load_mjcf, models.TREE),
     "mjcf of links": (dr.load_mjcf, models.LINKS),
     "urdf": (dr.load_urdf, models.ROBOT),
+    "saved scene": (dr.load_scene, invalid.saved_scene()),
 }
 PIECES = (
     "3", "-1", "0 0 0", "0 0 0 0 0 0", "1e300", "1e-300", "nan", "inf", '"a"', "[]", "{}", "null", "=", "\n", "-", "<a>",
