@@ -196,6 +196,23 @@ def test_a_valley_is_two_planes_and_a_roof_a_polygon(shape, points, other):
     jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-8), got, expected)
 
 
+def test_a_corner_that_has_fallen_into_a_valley_is_held_by_both_slopes():
+    """As far below as a step of free fall, under the vertex and beside it: as deep in both as in two half-spaces."""
+    box, place = dr.Box(half=vector(0.2, 0.2)), (vector(0.0, 0.0), vector(1.0, 0.0))
+    standing = vector(np.sqrt(0.5), np.sqrt(0.5))
+    grounds = [dr.Profile(points=jnp.asarray(VEE)), *(jax.tree.map(jnp.asarray, p.shape) for p in planes(VEE).values())]
+
+    @jax.jit
+    def gaps(corner):
+        x = VEE[1] + corner + vector(0.0, 0.2 * np.sqrt(2.0))
+        return [COLLIDERS[dr.Box, type(ground)](box, x, standing, ground, *place).gap for ground in grounds]
+
+    for corner in ((0.0, -1e-4), (3e-5, -1e-4), (-9e-5, -1e-4), (2e-4, -1e-4), (-2e-4, -1e-4)):
+        first, *others = map(np.asarray, gaps(jnp.asarray(corner)))
+        deep = np.concatenate(others)
+        assert_allclose(np.sort(first[first < 0]), np.sort(deep[deep < 0]), atol=1e-12)
+
+
 def test_mistakes_are_named():
     ball = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0))
     with pytest.raises(ValueError, match=r"points does not go to the right from point 1: sort them by x"):

@@ -5,12 +5,14 @@ with the core of the shape. A corner over a segment has the distance of its line
 as over one line. Beyond the end of a segment
 
     where it is beyond its neighbour's as well, over a convex vertex: the distance to the vertex is a contact
-    else, over a neighbour that rises from it: the distance of its line, which leads into the valley
+    else, over a neighbour that rises from it, or below both: the distance of its line, which leads into the valley
     else, above the line of the segment: it may get there within the step, but not touch there: ALERT
     else: there is nothing to meet
 
 and a vertex of the profile counts where it is convex and the normal of the body lies between those of its segments.
 """
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -110,13 +112,12 @@ def _corner_contacts(b: Profile, p: Array, rounding: Array, slack: Array, alert:
     up = _up(along)
     height, share = (jax.vmap(dot)(r, p[None] - start) for r in (up, along))
     before, after = _beyond(share, length)
-    over = jnp.maximum(before, after) <= slack[None]
-    best = jnp.where(over & (height < 0), height, -jnp.inf).max(0)  # inside, the least deep
     # `slack`: values that are computed twice may be rounded differently.
-    touches = over & ((height >= -slack[None]) | (_inside(b, p)[None] & (height >= (best - slack)[None])))
-    touches = touches | (
-        _over_valley(along, over, before - slack[None], after - slack[None]) & (height >= -slack[None])
-    )
+    over, below = jnp.maximum(before, after) <= slack[None], _below_valley(along, before, after)
+    best = jnp.where((over | below) & (height < 0), height, -jnp.inf).max(0)
+    deep = _inside(b, p)[None] & (over | below) & (height < 0) & (height >= (best - slack)[None])  # the least deep
+    beside = functools.partial(_over_valley, along, before=before - slack[None], after=after - slack[None])
+    touches = (over | beside(over)) & (height >= -slack[None]) | deep | beside(deep)
     next_before = jnp.concatenate([before[1:], jnp.full_like(before[:1], -jnp.inf)])
     at_vertex = (after > slack[None]) & (next_before > slack[None]) & (height > slack[None])
     near_end = jnp.where((before > after)[:, None], start, end)
@@ -134,14 +135,22 @@ def _over_valley(along: Array, over: Array, before: Array, after: Array) -> Arra
     """Whether a corner is over a neighbour that makes a valley with a segment, (S, *batch) bool.
 
     There the line of the segment continues below the neighbour: a corner that reaches it has reached the valley, even
-    if it has fallen a little since it was last held. Not between segments in line, on both of which it rests at once
-    (`on_next_segments`): it would be held by the line of the one as it falls past the other.
+    if it has fallen a little since it was last held, and one that is held in the valley falls past both lines. Not
+    between segments in line, on both of which it rests at once (`on_next_segments`): it would be held by the line of
+    the one as it falls past the other.
     """
     none = jnp.zeros_like(over[:1])
     rises, in_line = (jax.vmap(fn)(along[:-1], along[1:]) for fn in (_cross, dot))
     valley = jnp.concatenate([(rises > 0) & (in_line < 1.0 - STRAIGHT) & ~none, none])  # at its end
     over_next = jnp.concatenate([over[1:], none])
     return (_shifted(over & valley) & (after <= 0)) | (over_next & valley & (before <= 0))
+
+
+def _below_valley(along: Array, before: Array, after: Array) -> Array:
+    """Whether a corner is beyond the ends of both segments of a valley, below its vertex, (S, *batch) bool."""
+    below = (jax.vmap(_cross)(along[:-1], along[1:]) > 0) & (after[:-1] > 0) & (before[1:] > 0)
+    none = jnp.zeros_like(below[:1])
+    return jnp.concatenate([below, none]) | jnp.concatenate([none, below])
 
 
 def _shifted(flags: Array) -> Array:
