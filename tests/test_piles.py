@@ -70,7 +70,10 @@ def test_a_house_of_cards_stands():
 
 
 def test_two_blocks_slide_as_one():
-    """Closed form: a rider that sticks to a block slows down with it, by mu g, whatever the masses."""
+    """Closed form: a rider that sticks to a block slows down with it, by mu g, whatever the masses.
+
+    Under a heavy rider, a light block rubs more within a step than would stop it alone.
+    """
     time = 0.2
 
     def at_end(p):
@@ -84,13 +87,15 @@ def test_two_blocks_slide_as_one():
         end = dr.rollout(world, state, dt=1 / RATE, steps=round(time * RATE)).state
         return jnp.stack([end.x[-1, :, 0] - end.x[0, :, 0], end.v[-1, :, 0]])
 
-    p = {name: jnp.asarray(value) for name, value in {"m": 1.3, "v": 3.0, "mu": 0.4}.items()}
-    slopes, got = jax.jit(jax.jacfwd(lambda p: (end := at_end(p), end), has_aux=True))(p)
-    expected = [p["v"] * time - 0.5 * p["mu"] * G * time**2], [p["v"] - p["mu"] * G * time]
-    np.testing.assert_allclose(got, np.broadcast_to(expected, (2, 2)), rtol=1e-12)
+    both = jax.jit(jax.jacfwd(lambda p: (end := at_end(p), end), has_aux=True))
     right = {"m": [[0.0], [0.0]], "v": [[time], [1.0]], "mu": [[-0.5 * G * time**2], [-G * time]]}
-    for name, slope in right.items():
-        np.testing.assert_allclose(slopes[name], np.broadcast_to(slope, (2, 2)), atol=1e-9)
+    for mass, rounding in ((1.3, 1e-12), (1e-3, 1e-9)):
+        p = {name: jnp.asarray(value) for name, value in {"m": mass, "v": 3.0, "mu": 0.4}.items()}
+        slopes, got = both(p)
+        expected = [p["v"] * time - 0.5 * p["mu"] * G * time**2], [p["v"] - p["mu"] * G * time]
+        np.testing.assert_allclose(got, np.broadcast_to(expected, (2, 2)), rtol=rounding)
+        for name, slope in right.items():
+            np.testing.assert_allclose(slopes[name], np.broadcast_to(slope, (2, 2)), atol=1e3 * rounding)
 
 
 @pytest.mark.slow

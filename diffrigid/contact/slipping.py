@@ -116,7 +116,7 @@ def lost_to_stops(
     size, sense = jnp.minimum(jnp.abs(total), most_to_stop), jnp.where(total < 0, -1.0, 1.0).astype(total.dtype)
     own = sense * size * safe_divide(bounds, jnp.where(bound > least, bound, 0.0))
     whole = at_end_speed * bound + size * (speed - along)
-    stops = strikes.active & slipping & (size < STICKS * bound) & (T > 0)
+    stops = strikes.active & slipping & (jnp.abs(total) < STICKS * bound) & (T > 0)
     stops = stops & (at_end_speed > least) & (whole > least)
     share = safe_divide(speed * size, jnp.where(stops, whole, 0.0))  # tau / T
     per_speed = safe_divide(own, jnp.where(stops, at_end_speed, 0.0))
