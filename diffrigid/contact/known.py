@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.branches import any_world
-from diffrigid.collide.contacts import THERE
 from diffrigid.contact.cone import put, split, turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
@@ -46,8 +45,8 @@ class Known:
         return ((gap > 0) & (P != 0).any(1)).any(0)
 
     def there(self, strikes: Strikes) -> "Known":
-        """Only the impulses of contacts that are still there: those of faces that were left have no arms."""
-        on = strikes.gap < THERE
+        """Only the impulses of contacts that take part in this pass: no other would be found anew."""
+        on = strikes.active
         turning_rows = len(self.P) - len(on)
         on = jnp.concatenate([on[:turning_rows], on]) if turning_rows else on
         return jax.tree.map(lambda leaf: jnp.where(on if leaf.ndim == on.ndim else on[:, None], leaf, 0.0), self)
