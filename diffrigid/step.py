@@ -149,7 +149,8 @@ def step_length(dt: Any, state: State, batch: bool = False) -> Numbers:
 def _given_substeps(substeps: Any, intervals: int) -> tuple[int, ...]:
     """Number of steps of each interval, as given."""
     try:
-        counts = tuple(at_least_one("substeps", count) for count in substeps)
+        in_order = isinstance(substeps, tuple | list | np.ndarray)  # which a set is not
+        counts = tuple(at_least_one("substeps", count) for count in substeps) if in_order else ()
     except (TypeError, ValueError):
         counts = ()
     if len(counts) != intervals:

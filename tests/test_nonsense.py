@@ -37,9 +37,9 @@ few = st.lists(some, max_size=3)
 anything = st.one_of(some, few, few.map(tuple), st.lists(few, max_size=3))
 SCENES_OF = invalid.SHAPES | invalid.BODIES | invalid.SCENES | invalid.FORCES | invalid.JOINTS
 CHEAP = {name: entry for name, entry in SCENES_OF.items() if name != "names"}  # those, and columns, are keys of a dict
-# Where what is right costs a program or a fit, nothing is drawn that could be right, as what is empty.
+# Where what is right costs a program or a fit, nothing is drawn that could be right, as what is empty, or a function.
 COSTLY = {name: entry for name, entry in invalid.TABLE.items() if name not in (*SCENES_OF, "column names")}
-wrong = odd_objects.filter(lambda value: value is not None and value not in ("", b"", {}))
+wrong = odd_objects.filter(lambda value: value not in (None, len, "", b"", {}))
 
 
 def refuse_or_make(call, value):

@@ -138,9 +138,9 @@ def _lengths(name: str, values: Any, unit: str) -> np.ndarray:
 def _check_parts(loss: Any, solver: Any, intervals: Any, seed: Any, resume: Any) -> None:
     if isinstance(loss, type) or not hasattr(loss, "rho"):
         raise ValueError(f"loss is {loss!r}, expected squares(), huber() or student()")
-    if solver is not None and not callable(solver):
+    if solver is not None and (not callable(solver) or isinstance(solver, type)):
         raise ValueError(f"solver is {solver!r}, expected None, first_order(optax.adam(1e-2)) or lbfgs()")
-    if not callable(intervals):
+    if not callable(intervals) or isinstance(intervals, type):
         raise ValueError(f"intervals is {intervals!r}, expected from_jacobian, sandwich or bootstrap")
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"seed is {seed!r}, expected an integer >= 0")
