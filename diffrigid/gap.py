@@ -8,6 +8,7 @@ from jax import Array
 
 from diffrigid.collide import COLLIDERS
 from diffrigid.convert import nearest
+from diffrigid.shapes import UNEVEN
 from diffrigid.state import State, rotations
 from diffrigid.world import World, check
 
@@ -18,7 +19,8 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
     Negative where they overlap, then of the deepest contact. For `jit`, `vmap` and `grad`: what a controller sees.
 
     Raises:
-        ValueError: a name that is not there, a body without a shape, or two statics.
+        ValueError: a name that is not there, a body without a shape, two statics, or a `Profile` or `HeightField`, of
+            which a body knows only the parts that it may touch within a step.
 
     Differentiable, with a kink where the closest points jump.
 
@@ -44,6 +46,8 @@ def _placed(world: World, state: State, name: str) -> tuple[Any, Array, Array]:
     for shapes, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
         if k in owners:
             row = owners.index(k)
+            if isinstance(shapes, UNEVEN):
+                raise ValueError(f"gap: {name!r} is a {type(shapes).__name__}, to which there is no distance")
             if offset is not None:
                 x = x + rotations(world.dim).rotate(q, offset.r[row])
             return jax.tree.map(operator.itemgetter(row), shapes), x, q

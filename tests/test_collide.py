@@ -180,9 +180,11 @@ def test_a_gap_that_is_not_there_is_refused():
             "dot": dr.Body(None, mass=1.0, inertia=1.0, x=(1.0, 2.0)),
             "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
             "wall": dr.Static(dr.HalfSpace(normal=(1.0, 0.0))),
+            "hill": dr.Static(dr.Profile(points=((-2.0, 0.0), (0.0, -1.0), (2.0, 0.0)))),
         }
     )
     for names, why in (
+        (("ball", "hill"), "is a Profile, to which there is no distance"),
         (("ball", "flor"), "did you mean 'floor'"),
         (("ball", "dot"), "no shape"),
         (("floor", "wall"), "neither"),
