@@ -47,7 +47,6 @@ UNITS = {
 ABOUT_AXIS = {
     "lower": "rad", "upper": "rad", "rate": "rad/s", "speed": "rad/s", "friction": "N m", "damping": "N m s/rad",
 }  # fmt: skip
-LISTED = 9  # numbers that are listed, and not only their shape: of an inertia
 ALONG_AXIS = {"lower": "m", "upper": "m", "rate": "m/s", "speed": "m/s", "friction": "N", "damping": "N s/m"}
 
 
@@ -89,7 +88,7 @@ def read(world: World, state: State, path: str) -> Array:
         return joint_motion.read(world, state, *place.joint)
     if place.shape:
         return world.bodies.mass[place.row] / _solid(world, *place.shape)[0]
-    leaf = _leaf((world, state), place)
+    leaf = leaf_of((world, state), place)
     value: Any = leaf if place.row is None else _row(leaf, place.row)
     if path in COEFFICIENTS:
         return _row(value, 0)
@@ -240,41 +239,12 @@ def catalogue(world: World) -> Catalogue:
     return out
 
 
-def listing(world: World) -> str:
-    """Values and units of all parameters, those of one owner in a line; of many numbers, or traced ones, the shape."""
-    names = world.names + world.static_names
-    lines: dict[str, list[str]] = {}
-    kinds: dict[str, Any] = dict(zip(world.force_names, world.forces, strict=True)) | {"contact": world.contact}
-    for of_kind, joint in zip(world.joint_names, world.joints, strict=True):
-        kinds |= dict.fromkeys(of_kind, joint)
-    for shape, owners in zip(world.shapes, world.owners, strict=True):
-        kinds |= {names[owner]: shape for owner in owners}
-    for path, (place, *_) in catalogue(world).items():
-        owner, _, field = path.partition(".")
-        if field and place.chain[0] == 0 and not (place.angle or place.shape):
-            value, measure = _shown(_leaf((world, None), place), place.row), unit(world, path)
-            lines.setdefault(owner, []).append(f"{field.removeprefix('shape.')} {value} {measure}".rstrip())
-    kind = {owner: f" ({type(kinds[owner]).__name__})" if owner in kinds else "" for owner in lines}
-    listed = [f"{owner}{kind[owner]}: {', '.join(values)}" for owner, values in lines.items()]
-    return "\n".join([f"World, {world.dim}D", *listed])
-
-
-def _leaf(pair: tuple[World, Any], place: Place) -> Any:
+def leaf_of(pair: tuple[World, Any], place: Place) -> Any:
     """The whole leaf of which a place is a part."""
     leaf: Any = pair
     for key in place.chain:
         leaf = leaf[key] if isinstance(key, int) else getattr(leaf, key)
     return leaf
-
-
-def _shown(leaf: Any, row: int | None) -> str:
-    """A leaf, or a row of it, in a few characters."""
-    shape = np.shape(leaf)[row is not None :]
-    if not isinstance(leaf, Array | np.ndarray) or traced(leaf) or np.prod(shape) > LISTED:
-        return f"of shape {shape}"
-    of_row = np.asarray(leaf)[... if row is None else row]
-    text = np.array2string(of_row, separator=", ", formatter={"float_kind": "{:.5g}".format})
-    return " ".join(text.split())
 
 
 def _update(node: Any, chain: tuple, change) -> Any:

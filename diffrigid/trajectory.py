@@ -77,7 +77,7 @@ def checked(trajectory: Any, name: str = "trajectory") -> Trajectory:
         )
     if not isinstance(trajectory, Trajectory):
         raise ValueError(f"{name} is a {type(trajectory).__name__}: expected what `rollout` returns, or a dict of them")
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trajectory)):
+    if traced(trajectory):
         raise ValueError(f"{name} is traced by jit, vmap or grad: expected known values; use it outside, on the result")
     if np.ndim(trajectory.t) != 1:
         raise ValueError(

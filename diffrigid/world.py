@@ -66,7 +66,7 @@ class World:
 
     def __repr__(self) -> str:
         """A list of its parameters, with values and units."""
-        from diffrigid.paths import listing  # points down, so that a world prints itself
+        from diffrigid.listing import listing  # points down, so that a world prints itself
 
         return listing(self)
 

@@ -149,8 +149,8 @@ def _over_valley(along: Array, over: Array, before: Array, after: Array) -> Arra
 def _below_valley(along: Array, before: Array, after: Array) -> Array:
     """Whether a corner is beyond the ends of both segments of a valley, below its vertex, (S, *batch) bool."""
     below = (jax.vmap(_cross)(along[:-1], along[1:]) > 0) & (after[:-1] > 0) & (before[1:] > 0)
-    none = jnp.zeros_like(below[:1])
-    return jnp.concatenate([below, none]) | jnp.concatenate([none, below])
+    before_vertex = jnp.concatenate([below, jnp.zeros_like(below[:1])])
+    return before_vertex | _shifted(before_vertex)
 
 
 def _shifted(flags: Array) -> Array:

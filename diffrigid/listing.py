@@ -1,0 +1,41 @@
+"""A world as text: its parameters by path, with values and units."""
+
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from diffrigid.paths import catalogue, leaf_of, unit
+from diffrigid.shapes import traced
+from diffrigid.world import World
+
+LISTED = 9  # numbers that are listed, and not only their shape: of an inertia
+
+
+def listing(world: World) -> str:
+    """Values and units of all parameters, those of one owner in a line; of many numbers, or traced ones, the shape."""
+    names = world.names + world.static_names
+    lines: dict[str, list[str]] = {}
+    kinds: dict[str, Any] = dict(zip(world.force_names, world.forces, strict=True)) | {"contact": world.contact}
+    for of_kind, joint in zip(world.joint_names, world.joints, strict=True):
+        kinds |= dict.fromkeys(of_kind, joint)
+    for shape, owners in zip(world.shapes, world.owners, strict=True):
+        kinds |= {names[owner]: shape for owner in owners}
+    for path, (place, *_) in catalogue(world).items():
+        owner, _, field = path.partition(".")
+        if field and place.chain[0] == 0 and not (place.angle or place.shape):
+            value, measure = _shown(leaf_of((world, None), place), place.row), unit(world, path)
+            lines.setdefault(owner, []).append(f"{field.removeprefix('shape.')} {value} {measure}".rstrip())
+    kind = {owner: f" ({type(kinds[owner]).__name__})" if owner in kinds else "" for owner in lines}
+    listed = [f"{owner}{kind[owner]}: {', '.join(values)}" for owner, values in lines.items()]
+    return "\n".join([f"World, {world.dim}D", *listed])
+
+
+def _shown(leaf: Any, row: int | None) -> str:
+    """A leaf, or a row of it, in a few characters."""
+    shape = np.shape(leaf)[row is not None :]
+    if not isinstance(leaf, Array | np.ndarray) or traced(leaf) or np.prod(shape) > LISTED:
+        return f"of shape {shape}"
+    of_row = np.asarray(leaf)[... if row is None else row]
+    text = np.array2string(of_row, separator=", ", formatter={"float_kind": "{:.5g}".format})
+    return " ".join(text.split())
