@@ -128,13 +128,13 @@ def _light_inertia(problem: Problem, scene: Scene) -> list[str]:
     for i, name in enumerate(after.names):
         if f"{name}.mass" not in paths or f"{name}.density" not in catalogue(after):
             continue
-        solid = write(
-            before.world, before.state, f"{name}.density", read(before.world, before.state, f"{name}.density")
-        )
-        was, would_be, is_now = (np.asarray(world.bodies.inertia[i]) for world in (before.world, solid[0], after))
         factor = float(after.bodies.mass[i] / before.world.bodies.mass[i])
-        kept = np.allclose(was, would_be) and (is_now == was).all()
-        if kept and max(factor, 1.0 / factor) > OTHER and _is_turned(after, i):
+        if max(factor, 1.0 / factor) <= OTHER or not _is_turned(after, i):
+            continue
+        density = read(before.world, before.state, f"{name}.density")
+        solid, _ = write(before.world, before.state, f"{name}.density", density)
+        was, would_be, is_now = (np.asarray(world.bodies.inertia[i]) for world in (before.world, solid, after))
+        if np.allclose(was, would_be) and (is_now == was).all():
             out.append(
                 f"{name}.mass is {factor:.2g} times what it was, {name}.inertia is as it was: where {name} is solid, "
                 f"free {name}.density instead, which sets both"
