@@ -56,7 +56,7 @@ def rollout_batch(
     and the result lies where it was computed (`jax.experimental.multihost_utils.process_allgather` brings it together).
 
     Raises:
-        ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps < 1; memory < 1;
+        ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps, chunk or memory < 1;
             controls that forces do not take, or lack.
 
     Example:

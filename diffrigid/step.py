@@ -73,8 +73,9 @@ def rollout(
             steps fits into a thousandth of it, no step is recomputed, which compiles faster.
 
     Raises:
-        ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing; memory < 1;
-            controls that forces do not take, or lack.
+        ValueError: shapes or types of world and state do not fit; dt <= 0; steps < 1; times not increasing; both steps
+            and times, or neither; substeps without times, not one integer >= 1 for each interval, or missing where
+            times or dt is traced; memory < 1; controls that forces do not take, or lack.
 
     Both modes of differentiation work.
 
@@ -86,6 +87,8 @@ def rollout(
     check(world, state)
     if (steps is None) == (times is None):
         raise ValueError(f"rollout: give either steps or times, got {'neither' if steps is None else 'both'}")
+    if times is None and substeps is not None:
+        raise ValueError("rollout: substeps divide the intervals of times; without these, make dt smaller instead")
     world, state = floats(world, state)
     longest, memory = step_length(dt, state), at_least_one("memory", memory)
     if times is None:

@@ -257,6 +257,7 @@ RUNS = {
     "rollout steps": (lambda v: roll(steps=v), INTEGER),
     "rollout times": (lambda v: roll(steps=None, times=v), (*TIMES, None)),
     "rollout substeps": (lambda v: roll(steps=None, times=(0.0, 0.1, 0.2), substeps=v), (*ODD, 1, (1,), (1, 1, 1), (0, 1), (1.5, 1), (-1, 1), "ab", (None, 1), {1, 2})),
+    "rollout steps, substeps": (lambda v: roll(substeps=v), ((1, 1), [2], 1)),
     "rollout state.x": (lambda v: dr.rollout(pair()[0], dr.replace(pair()[1], x=v), dt=0.1, steps=1), WORDS),
     "rollout world.mass": (lambda v: dr.rollout(dr.replace(pair()[0], bodies=v), pair()[1], dt=0.1, steps=1), RECORD),
     "batch world": (lambda v: dr.rollout_batch(v, many()[1], dt=0.1, steps=1), (*RECORD, None)),

@@ -125,8 +125,17 @@ def test_a_parameter_that_is_derived_has_its_own_interval(fit, intervals):
     for end in ("value", "low", "high"):
         assert_allclose(getattr(gravity, end), getattr(fit["gravity"], end), rtol=1e-12)
         assert_allclose(getattr(position, end), getattr(fit["p.x"], end)[2], rtol=1e-12)
-    with pytest.raises(ValueError, match="record is 6: expected 0 to 5"):
-        fit.derived(lambda world, state: state.x[0], record=RECORDS)
+
+
+def test_questions_to_a_fit_that_have_no_answer(fit, records):
+    for ask in (partial(fit.derived, lambda world, state: state.x[0]), fit.predict):
+        for record in (RECORDS, -1):
+            with pytest.raises(ValueError, match=f"record is {record}: expected 0 to 5"):
+                ask(record=record)
+    with pytest.raises(ValueError, match="expected from_jacobian, sandwich or bootstrap"):
+        fit.with_intervals(dr.Disc)
+    with pytest.raises(ValueError, match="starts is 0, expected an integer >= 1"):
+        fit.score(records, starts=0)
 
 
 def test_what_lies_beyond_the_last_window_is_left_out(records, fit):
@@ -288,7 +297,7 @@ def test_a_fit_that_has_not_converged_says_so(records):
     assert few.notes[0].startswith("not converged after 1 iterations")
 
 
-def test_noise_that_is_given_does_not_change_a_score(fit, records):
+def test_noise_that_is_given_does_not_change_a_score(records):
     """A score is in the unit of its column, whoever knows the noise."""
     rows = len(records[0].observations["t"])
     known = [dr.Record(records[0].observations, state=records[0].state, noise={"p.x": np.linspace(0.5, 2.0, rows)})]
@@ -469,6 +478,9 @@ def test_design_for_one_of_several_numbers():
     assert widths[1] < widths[0]
     with pytest.raises(ValueError, match="'spring.dampin' is not free, did you mean 'spring.damping'"):
         plan(target="spring.dampin")
+    for few in ("starts", "steps"):
+        with pytest.raises(ValueError, match=f"{few} is 0, expected an integer >= 1"):
+            plan(**{few: 0})
 
 
 def test_figures_show_residuals_costs_correlations_and_profiles(fit):

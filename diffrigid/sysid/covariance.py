@@ -8,10 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtrit
 
 BLOCKS = 20  # pieces of time that stand for independent runs where there is only one record
 LEFT = 0.01  # [-] of the information in a direction: if all clusters but one have less, they do not determine it
 DRAWS = 2000  # of the bootstrap
+LEAST_FREE = 0.05  # [-] least share of degrees of freedom that is taken to be left
 MANY = 1e6  # degrees of freedom for which Student's distribution is the normal one
 
 
@@ -38,8 +40,19 @@ class Uncertainty:
     covariance: np.ndarray
     freedom: float
 
+    @property
+    def quantile(self) -> float:
+        """Half width of a 95 % interval, in standard deviations."""
+        return float(stdtrit(self.freedom, 0.975))
+
 
 Intervals = Callable[[Linear], Uncertainty]
+
+
+def check_intervals(intervals: Intervals) -> None:
+    """Raise ValueError unless this can be a function that gives intervals."""
+    if not callable(intervals) or isinstance(intervals, type):
+        raise ValueError(f"intervals is {intervals!r}, expected from_jacobian, sandwich or bootstrap")
 
 
 def from_jacobian(linear: Linear) -> Uncertainty:

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.controls import controlled
-from diffrigid.convert import nearest
+from diffrigid.convert import at_least_one, nearest
 from diffrigid.paths import component, unit
 from diffrigid.state import State
 from diffrigid.sysid.channels import channel_of
-from diffrigid.sysid.covariance import MANY, Linear, from_jacobian
+from diffrigid.sysid.covariance import Linear, from_jacobian
 from diffrigid.sysid.diagnosis import Coordinate, blind_directions, infinite_where_blind
 from diffrigid.sysid.intervals import coordinates_of, interval_of, unit_of, unseen_of
 from diffrigid.sysid.levenberg import point_at
@@ -29,7 +29,7 @@ from diffrigid.world import World
 
 EXPECTED = ("parameter", "value", "expected 95 % interval", "unit")
 NUDGE = 1e-3  # change of z for differences
-QUANTILE = 1.959964  # 97.5 % of the normal distribution are below
+UNDETERMINED = 1e6  # score where a number has no interval: finite, so that differences of scores are
 SHRINK, GROW = 0.5, 1.5  # factor on the length of a step that loses, or gains
 
 
@@ -76,10 +76,10 @@ def expected_intervals(
     """
     problem = _problem(world, state, [state], planned, free, noise, observe, dt)
     linear, (z, _), out = _linear(problem), first_numbers(problem), []
-    covariance, blind = from_jacobian(linear).covariance, blind_directions(linear, coordinates_of(problem))
+    uncertainty, blind = from_jacobian(linear), blind_directions(linear, coordinates_of(problem))
     for slot, rows in pieces(problem.shared):
         about, unseen = first_value(problem, slot), unseen_of(blind, rows)
-        ends = interval_of(slot, z[rows], covariance[rows, rows], about, QUANTILE, unseen)
+        ends = interval_of(slot, z[rows], uncertainty.covariance[rows, rows], about, uncertainty.quantile, unseen)
         out.append(Parameter(slot.name, *ends, unit_of(problem, slot), "expected"))
     return tuple(out)
 
@@ -115,8 +115,9 @@ def best_launch(
     The gradient of the information is by central differences of exact Jacobians, all launches in one batch.
 
     Raises:
-        ValueError: the target is not free, or what `expected_intervals` does not take.
+        ValueError: the target is not free; starts or steps < 1; what `expected_intervals` does not take.
     """
+    starts, steps = at_least_one("starts", starts), at_least_one("steps", steps)
     plan = partial(_problem, world, state, planned=planned, free=free, noise=noise, observe=observe, dt=dt)
     scene = scene_of(plan([state]).runs[0])
     slots, _ = make_slots(vary, [scene])
@@ -217,6 +218,6 @@ def _score(linear: Linear, places: Sequence[Coordinate], rows: slice) -> float:
     covariance = infinite_where_blind(from_jacobian(linear).covariance, blind, slice(0, linear.shared))
     covariance = covariance[rows, rows]
     if not np.isfinite(covariance).all():
-        return MANY
+        return UNDETERMINED
     sign, logarithm = np.linalg.slogdet(covariance)
-    return float(0.5 * logarithm / len(covariance)) if sign > 0 and np.isfinite(logarithm) else MANY
+    return float(0.5 * logarithm / len(covariance)) if sign > 0 and np.isfinite(logarithm) else UNDETERMINED

@@ -121,7 +121,7 @@ def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
     if len(parts) == 1:
         return f"nothing that was measured depends on {names[0]}"
     scales = steps[[c.name.endswith((".inertia[0]", ".inertia[1]", ".inertia[2]")) for c, _ in parts]]
-    if len(scales) == 3 and len({c.path for c, _ in parts}) == 1 and np.ptp(scales) < 0.02:  # see `free.inertia`
+    if len(scales) == 3 and len({c.path for c, _ in parts}) == 1 and np.ptp(scales) < 0.02:  # see `charts.inertia`
         return f"only the ratios of {parts[0][0].path} are seen: all times one factor is the same motion"
     if all(c.logarithmic for c, _ in parts):
         if len(parts) == 2:

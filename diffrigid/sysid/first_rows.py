@@ -19,7 +19,8 @@ from diffrigid.world import World
 ROWS = 5  # rows of a column that the line is laid through
 THIN = 1e-2  # [-] of the length of a cloud of markers: a thinner one does not show how it is turned about its line
 BENT = 10.0  # [-] times the squares left by a parabola: of noise about a line, a line leaves as many 5 % of the time
-RATES = {"x": "v", "angle": "w", "q": "w", "translation": "rate"}  # of a body, or of a slider
+RATES = {"x": "v", "angle": "w", "q": "w"}  # of a body
+COORDINATES = ("angle", "translation")  # of a hinge, and of a slider
 
 
 def begun(run: Run, slots: Sequence[Slot]) -> Run:
@@ -71,12 +72,12 @@ def shown(
             out[f"{body}.angle"] = _line(t, np.arctan2(q[:, 1:], q[:, :1]), "angle")[0]
     for s in series:
         channel, observer = channels[s.name], channels[s.name].observer
-        if not isinstance(observer, Part | JointPart) or observer.field not in RATES:
-            continue
-        if isinstance(observer, JointPart):
+        if isinstance(observer, JointPart) and observer.field in COORDINATES:
             owner, rate = observer.joint, "rate"
-        else:
+        elif isinstance(observer, Part) and observer.field in RATES:
             owner, rate = world.names[observer.body], RATES[observer.field]
+        else:
+            continue
         later = s.t >= start - SAME
         t, values = s.t[later] - start, (s.values[later] - channel.bias) / channel.scale
         pose, slope = _turning(world.dim, t, values) if observer.field == "q" else _line(t, values, observer.field)

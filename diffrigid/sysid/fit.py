@@ -11,7 +11,16 @@ from diffrigid.convert import at_least_one, numbers
 from diffrigid.state import State
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.columns import check_mapping
-from diffrigid.sysid.covariance import Intervals, Linear, eliminated, from_jacobian, information, inverse
+from diffrigid.sysid.covariance import (
+    LEAST_FREE,
+    Intervals,
+    Linear,
+    check_intervals,
+    eliminated,
+    from_jacobian,
+    information,
+    inverse,
+)
 from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.intervals import describe
 from diffrigid.sysid.levenberg import INTERRUPTED, Point, Report, cost_of, levenberg
@@ -101,7 +110,7 @@ def fit(
     problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
     stages = _stages((problem.width,) if widths is None else widths, windows)
     if world.crowd and any(width > 0 for width, _ in stages):
-        raise ValueError(f"widths is {widths!r}: expected (0.0,) for so many bodies; use fewer than 256")
+        raise ValueError(f"widths is {widths!r}: expected (0.0,) for so many bodies; use fewer")
     solve = levenberg if solver is None else solver
     z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)
@@ -140,8 +149,7 @@ def _check_parts(loss: Any, solver: Any, intervals: Any, seed: Any, resume: Any)
         raise ValueError(f"loss is {loss!r}, expected squares(), huber() or student()")
     if solver is not None and (not callable(solver) or isinstance(solver, type)):
         raise ValueError(f"solver is {solver!r}, expected None, first_order(optax.adam(1e-2)) or lbfgs()")
-    if not callable(intervals) or isinstance(intervals, type):
-        raise ValueError(f"intervals is {intervals!r}, expected from_jacobian, sandwich or bootstrap")
+    check_intervals(intervals)
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"seed is {seed!r}, expected an integer >= 0")
     if resume is not None and not isinstance(resume, Fit | Summary):
@@ -194,7 +202,7 @@ def estimated_noise(problem: Problem, point: Point, loss: Any) -> dict[str, floa
     for name, sigma in problem.noise.items():
         free = [r[name] for run, r in zip(problem.runs, residuals, strict=True) if name in r and name not in run.noise]
         values = np.concatenate([piece[np.isfinite(piece)] for piece in free])
-        share = max(1.0 - lost[name] / max(len(values), 1), 0.05)
+        share = max(1.0 - lost[name] / max(len(values), 1), LEAST_FREE)
         size = np.mean(values**2) if isinstance(loss, Squares) else (1.4826 * np.median(np.abs(values))) ** 2
         found[name] = max(float(sigma * np.sqrt(size / share)), LEAST) if len(values) else sigma
     return found

@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.special import stdtrit
 
 from diffrigid.paths import component, unit, write
 from diffrigid.state import State
-from diffrigid.sysid.covariance import Linear, Uncertainty, joint_covariance, own_covariance
+from diffrigid.sysid.covariance import LEAST_FREE, Linear, Uncertainty, joint_covariance, own_covariance
 from diffrigid.sysid.diagnosis import (
     Blind,
     Coordinate,
@@ -50,7 +49,7 @@ def _parameters(
     problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
     blind: Sequence[Blind],
 ) -> Iterator[Parameter]:  # fmt: skip
-    quantile, covariance = float(stdtrit(uncertainty.freedom, 0.975)), uncertainty.covariance
+    quantile, covariance = uncertainty.quantile, uncertainty.covariance
     for slot, rows in pieces(problem.shared):
         about, unseen = first_value(problem, slot), unseen_of(blind, rows)
         ends = interval_of(slot, shared[rows], covariance[rows, rows], about, quantile, unseen)
@@ -96,7 +95,7 @@ def _notes(
         for name in run.noise:
             given.setdefault(name, []).append(record[name][np.isfinite(record[name])])
     columns = {name: r for name, parts in given.items() if len(r := np.concatenate(parts))}
-    wrong = misjudged(columns, max(1.0 - lost / count, 0.05))  # then columns together are not normal in any case
+    wrong = misjudged(columns, max(1.0 - lost / count, LEAST_FREE))  # then columns together are not normal in any case
     return notes + wrong + doubts(series, bool(wrong) or not isinstance(loss, Squares))
 
 
@@ -169,7 +168,7 @@ def derived(
     numbers = jnp.asarray(np.concatenate([shared, own[:, record]]), problem.dtype)
     covariance = joint_covariance(linear, record, uncertainty.covariance)
     unseen = unseen_of(blind_directions(linear, coordinates_of(problem)), slice(0, len(numbers)))
-    ends = _to_first_order(of_numbers, numbers, covariance, float(stdtrit(uncertainty.freedom, 0.975)), unseen)
+    ends = _to_first_order(of_numbers, numbers, covariance, uncertainty.quantile, unseen)
     return Parameter(getattr(fn, "__name__", type(fn).__name__), *ends, unit="", note="")
 
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import stdtrit
 
 from diffrigid.convert import at_least_one
 from diffrigid.sysid.free import Free
@@ -18,6 +17,7 @@ from diffrigid.sysid.summary import Parameter
 WIDE = 1.6  # [-] of the half width of the interval from the Jacobian: extent of the profile on either side
 FURTHER = 3  # how often that is then doubled, where the cost has not risen to the level
 REFINED = 2  # how often the level is bracketed again after such steps
+HELD = 30  # iterations for the other numbers
 FAR = 15.0  # z at which a bounded number is at its bound to single precision
 
 
@@ -62,7 +62,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
     if at_least_one("points", points) % 2 == 0 or points < 3:
         raise ValueError(f"points is {points}: expected an odd number from 3 on, the fitted value in the middle")
     kind, index = _kind_and_index(fit, name)
-    quantile = float(stdtrit(fit.uncertainty.freedom, 0.975))
+    quantile = fit.uncertainty.quantile
     deviation = float(np.sqrt(fit.covariance[index, index]))
     half = WIDE * quantile * deviation if np.isfinite(deviation) and deviation < 10 else 5.0
     level, most = 0.5 * quantile**2, np.inf if np.isinf(kind.low) else FAR
@@ -136,7 +136,7 @@ def _rises(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
         shared[index] = held
         own = np.repeat(fit.own[..., None], count, axis=-1)
         start = Numbers(*(jnp.asarray(part, fit.problem.dtype) for part in (shared, own)))
-        point, _ = levenberg(fit.problem.groups, start, fit.loss, 30, reach)
+        point, _ = levenberg(fit.problem.groups, start, fit.loss, HELD, reach)
         out.append(np.asarray(cost_of(fit.loss, point.residuals), float))
     return np.maximum(np.concatenate(out)[: len(z)] - fit.costs[0], 0.0)
 

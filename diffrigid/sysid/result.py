@@ -10,8 +10,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.convert import at_least_one
 from diffrigid.state import State
-from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty
+from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, check_intervals
 from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.first_rows import is_shown
 from diffrigid.sysid.intervals import derived, describe
@@ -138,9 +139,9 @@ class Fit:
             dt: [s] longest step; default that of the fit.
 
         Raises:
-            ValueError: times begin before the record.
+            ValueError: times begin before the record; there is no such record.
         """
-        scene, run = self.scenes[record], self.problem.runs[record]
+        scene, run = self.scenes[checked(self, record)], self.problem.runs[record]
         wanted = all_times(run) if times is None else np.asarray(times, float)
         if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME or not (np.diff(wanted) > 0).all():
             given = f"times has shape {wanted.shape}" + (f" and begins at {wanted.flat[0]:g} s" if wanted.size else "")
@@ -155,7 +156,16 @@ class Fit:
         Numbers that each record has for itself are fitted anew, from several starts if asked for, the first from its
         state, or else from its first rows, and where they show none from the state of the first record of the fit, with
         a warning if that ends far off; for a record that was fitted, from the values found.
+
+        Args:
+            observations: one record or several, as `fit` takes them.
+            starts: number of starts, from which the best is taken.
+            seed: of the draw of the starts after the first.
+
+        Raises:
+            ValueError: starts < 1; observations that `fit` would not take.
         """
+        starts = at_least_one("starts", starts)
         free, observe = self.problem.free, self.problem.observe
         scored = runs(self.world, self.state, observations, observe, None)
         fitted = [[k for k, run in enumerate(self.problem.runs) if same_data(run, other)] for other in scored]
@@ -208,12 +218,11 @@ class Fit:
             >>> bool(lost.low < 1.0 - 0.8**2 < lost.high)  # share of the energy that an impact takes
             True
         """
-        if record not in range(len(self.scenes)):
-            raise ValueError(f"record is {record!r}: expected 0 to {len(self.scenes) - 1}")
-        return derived(self.problem, self.shared, self.own, self.linear, self.uncertainty, fn, record)
+        return derived(self.problem, self.shared, self.own, self.linear, self.uncertainty, fn, checked(self, record))
 
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
+        check_intervals(intervals)
         uncertainty = intervals(self.linear)
         parameters, notes = describe(
             self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.loss
@@ -252,3 +261,10 @@ class Fit:
 
     def _repr_html_(self) -> str:
         return html_table(self.summary)
+
+
+def checked(fit: Fit, record: int) -> int:
+    """The number of a record of the fit; a ValueError if there is no such one."""
+    if record not in range(len(fit.scenes)):
+        raise ValueError(f"record is {record!r}: expected 0 to {len(fit.scenes) - 1}")
+    return record
