@@ -4,6 +4,7 @@ Every function takes the name of the argument first, for its messages. Known val
 `jit` even a constant is traced as soon as JAX holds it.
 """
 
+import dataclasses
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -287,11 +288,13 @@ def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
         )
     if not isinstance(getattr(force, "control", None), str | None):
         raise ValueError(f"{name}.control is {force.control!r}: expected the name of a control, or None.")
+    if getattr(force, "planar", False) and dim != 2:
+        raise ValueError(f"{name} is a {type(force).__name__}, for 2D: in 3D let bodies slide on a HalfSpace.")
     changes: dict[str, Any] = {}
+    needed = [field.name for field in dataclasses.fields(force) if field.default is dataclasses.MISSING]
     for field in ("body", "a", "b"):
         target = getattr(force, field, None)
-        needed = hasattr(force, field) and field != "b"
-        if (needed or target is not None) and (not isinstance(target, str) or target not in bodies):
+        if (field in needed or target is not None) and (not isinstance(target, str) or target not in bodies):
             raise ValueError(
                 f"{name}.{field} is {target!r}, which is not a moving body: {nearest(str(target), bodies)}"
             )

@@ -6,6 +6,8 @@ attributes let the step skip work, and all default to the general case when abse
     constant   the wrench does not change within a step, so the flight of the step is exact
     uniform    every body has the same constant acceleration, so that relative paths are straight
     twists     the wrench has a torque
+
+A `planar` one is for 2D only.
 """
 
 from typing import Any, ClassVar
@@ -14,9 +16,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.numerics import dot, norm, normalise
+from diffrigid.numerics import dot, norm, normalise, safe_divide, safe_sqrt
 from diffrigid.pytree import Leaf, array, pytree, static
 from diffrigid.state import Bodies, State, Wrench, material_point, material_velocity, rotations
+
+SPREAD = 0.94  # [-] mean distance from the centre over the radius of gyration: 0.943 of a disc, 0.937 of a square
 
 
 @pytree
@@ -65,6 +69,52 @@ class Drag:
         if self.quadratic is not None:
             F = F - self.quadratic * jax.vmap(lambda v: norm(v) * v)(state.v)
         return Wrench(F=F, tau=-self.angular[None, None] * state.w)
+
+
+@pytree
+class GroundFriction:
+    """Dry friction of bodies that slide on level ground, seen from above: pucks, cars, billiard balls. In 2D.
+
+    F = -P v and tau = -P arm^2 w with P = friction m g / sqrt(v^2 + arm^2 w^2 + slow^2), so that a spin makes a slide
+    longer, and both end together. Of several records on one body the forces add. What pushes a body with less than
+    `friction m g` makes it creep, by up to `slow`; where that is below friction g dt / 3, a body at rest trembles.
+    Source: Howe and Cutkosky, Int. J. Robotics Research 15 (1996) 557, the ellipsoid as limit surface.
+
+    Args:
+        body: the name of one; None: all bodies.
+        friction: (*batch) [-]
+        arm: (*batch) [m] mean distance of the pressure from the centre of mass; None: 0.94 radii of gyration, as of
+            discs and squares whose weight is spread evenly, 2/3 of the radius of a disc.
+        g: (*batch) [m/s^2] by which weight presses on the ground.
+        slow: (*batch) [m/s] speed below which friction falls to zero.
+
+    Example:
+        >>> puck = dr.Body(dr.Disc(radius=0.1), mass=2.0, x=(0.0, 0.0), v=(1.0, 0.0))
+        >>> made, start = dr.scene({"puck": puck}, forces={"ice": dr.GroundFriction(friction=0.1)})
+        >>> end = dr.rollout(made, start, dt=1 / 60, steps=120)["puck.x"][-1, 0]
+        >>> round(float(end), 3), round(1.0**2 / (2 * 0.1 * 9.81), 3)  # v^2 / (2 friction g)
+        (0.51, 0.51)
+    """
+
+    body: str | None = static(None, kw_only=False)
+    friction: Leaf = array()
+    arm: Leaf = array(default=None)
+    g: Leaf = array(default=9.81)
+    slow: Leaf = array(default=0.01)
+    constant: ClassVar[bool] = False
+    uniform: ClassVar[bool] = False
+    twists: ClassVar[bool] = True
+    planar: ClassVar[bool] = True
+
+    def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:
+        del controls
+        arm = SPREAD * jnp.sqrt(bodies.inertia / bodies.mass) if self.arm is None else self.arm[None]
+        most = self.friction[None] * bodies.mass * self.g[None]
+        if self.body is not None:
+            most = jnp.zeros_like(most).at[self.body].set(most[self.body])
+        v, w = state.v, state.w
+        P = safe_divide(most, safe_sqrt((v**2).sum(1) + (arm * w[:, 0]) ** 2 + self.slow[None] ** 2))
+        return Wrench(F=-P[:, None] * v, tau=-(P * arm**2)[:, None] * w)
 
 
 @pytree

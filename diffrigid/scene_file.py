@@ -58,7 +58,7 @@ KINDS: dict[str, Callable] = {
     for name in ("interval", "positive", "real", "direction", "rotation", "inertia", "shares")
 }
 SHAPES = {re.sub("(?<=.)([A-Z])", r"_\1", kind.__name__).lower(): kind for kind in shapes.SHAPES}
-FORCES = {"spring": forces.SpringDamper} | {
+FORCES = {"spring": forces.SpringDamper, "ground_friction": forces.GroundFriction} | {
     kind.__name__.lower(): kind for kind in (forces.Drag, forces.Force, forces.Torque)
 }
 JOINTS = {kind.__name__.lower(): kind for kind in joints.JOINTS}

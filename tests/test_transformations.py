@@ -347,6 +347,52 @@ def test_quadratic_drag_bounds_the_speed_of_a_fall():
     assert_allclose(end.x[0], (0.0, -(u**2) / g * np.log(np.cosh(g * t / u))), rtol=1e-6)
 
 
+def test_ground_friction_stops_slides_and_spins():
+    """Where arm is the radius of gyration, v and arm w fall in one proportion, at friction g, and stop at once.
+
+    Pucks that do not spin slide s = v^2 / (2 friction g); one strikes another, with the restitution e, after 0.3 m.
+    """
+    e, g, m, v, w, gyration = 0.8, 9.81, 1.5, np.array([1.2, -0.5]), 6.0, 0.12
+    disc, at = dr.Disc(radius=0.1), {"first": (2.0, 0.0), "second": (2.5, 0.0), "free": (0.0, 3.0)}
+    bodies = {name: dr.Body(disc, mass=1.0, x=x) for name, x in at.items()}
+    bodies["free"] = dr.Body(disc, mass=1.0, x=at["free"], v=(0.3, 0.0))
+    turning = dr.Body(disc, mass=m, inertia=m * gyration**2, x=(0.0, 0.0), v=v, w=w)
+    grounds = {name: dr.GroundFriction(name, friction=0.2, arm=gyration) for name in ("turning", "first", "second")}
+
+    def ends(mu, speed):
+        start = bodies | {"turning": turning, "first": dr.replace(bodies["first"], v=speed * jnp.array([1.0, 0.0]))}
+        forces = {f"under {name}": dr.replace(ground, friction=mu) for name, ground in grounds.items()}
+        run = dr.rollout(*dr.scene(start, restitution=e, forces=forces), dt=1 / 120, steps=240)
+        return jnp.stack([run["turning.x"][60, 0], run["turning.w"][60, 0], run["turning.angle"][-1],
+                          run["first.x"][-1, 0], run["second.x"][-1, 0], run["free.x"][-1, 0]])  # fmt: skip
+
+    def exact(mu, speed):
+        t, u = 0.5, np.hypot(np.hypot(*v), gyration * w)
+        slid, hit = mu * g * t / u, speed**2 - 2 * mu * g * 0.3
+        halt = hit * np.array([(1 - e) / 2, (1 + e) / 2]) ** 2 / (2 * mu * g)
+        turn = w * u / (2 * mu * g)
+        return np.array([v[0] * t * (1 - slid / 2), w * (1 - slid), turn, 2.3 + halt[0], 2.5 + halt[1], 0.6])
+
+    at = 0.2, 1.5
+    slopes = [(exact(*(at + h)) - exact(*(at - h))) / 2e-6 for h in 1e-6 * np.eye(2)]
+    assert_allclose(ends(*at)[jnp.array([0, 1, 5])], exact(*at)[[0, 1, 5]], rtol=3e-4)
+    assert_allclose(ends(*at), exact(*at), atol=1e-3)  # slower than 0.01 m/s friction falls off
+    assert_allclose(jax.jacfwd(ends, (0, 1))(*at), slopes, atol=5e-3, rtol=2e-3)
+
+
+def test_weight_is_spread_over_the_ground_as_over_a_disc():
+    """tau = 2/3 friction m g R of a disc that spins on the spot."""
+    R, m, mu = 0.3, 2.0, 0.4
+    world, state = dr.scene(
+        {"disc": dr.Body(dr.Disc(radius=R), mass=m, x=(0.0, 0.0), w=5.0)}, forces=[dr.GroundFriction(friction=mu)]
+    )
+    tau = world.forces[0](world.bodies, state, None).tau
+    assert_allclose(tau, -2 / 3 * mu * m * 9.81 * R, rtol=4e-3)
+    with pytest.raises(ValueError, match="groundfriction is a GroundFriction, for 2D: in 3D let bodies slide"):
+        ball = dr.Body(dr.Sphere(radius=R), mass=m, x=(0.0, 0.0, 0.0))
+        dr.scene({"ball": ball}, forces=[dr.GroundFriction(friction=mu)])
+
+
 def test_spring_and_damper_oscillate():
     """Along x about the rest length: a damped harmonic oscillator, l - length = A exp(-gamma t) cos(omega t)."""
     m, k, c, length, t = 0.8, 30.0, 0.6, 1.0, 1.3
