@@ -5,7 +5,8 @@
 
 Letters of array axes, everywhere: N bodies, D space (2 or 3), A angular (1 or 3), Q orientation (2 or 4),
 S statics, C contacts, P pairs, K contacts of a pair, R rows (of joints, or of a matrix), E equations of a joint,
-V corners of a shape, T time steps; trailing batch axes follow them. A module that needs others says so.
+V corners of a shape, T time steps, B worlds of a batch; trailing batch axes follow them. A module that needs others
+says so.
 """
 
 from importlib.metadata import version
@@ -16,7 +17,7 @@ from diffrigid import view as view
 from diffrigid.batch import rollout_batch
 from diffrigid.compiling import QUICK, compile_for_speed
 from diffrigid.contact import Contact
-from diffrigid.forces import Drag, Force, Gravity, SpringDamper, Torque
+from diffrigid.forces import Drag, Force, Gravity, GroundFriction, SpringDamper, Torque
 from diffrigid.gap import gap
 from diffrigid.impacts import contacts
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
@@ -79,6 +80,7 @@ __all__ = [
     "Fit",
     "Force",
     "Gravity",
+    "GroundFriction",
     "HalfSpace",
     "HeightField",
     "Homography",

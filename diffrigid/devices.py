@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-SHARE = PartitionSpec("devices")
+ALONG_DEVICES = PartitionSpec("devices")
 
 
 def devices() -> list[jax.Device]:
@@ -37,8 +37,8 @@ def over_devices(fn: Callable, parts: Any, whole: Any) -> Any:
     if len(devices()) == 1:
         return fn(parts, whole)
     # Without the check of which values vary between devices: it does not support the loops and solves inside.
-    specs = (SHARE, PartitionSpec())
-    return jax.shard_map(fn, mesh=_mesh(), in_specs=specs, out_specs=SHARE, check_vma=False)(parts, whole)
+    specs = (ALONG_DEVICES, PartitionSpec())
+    return jax.shard_map(fn, mesh=_mesh(), in_specs=specs, out_specs=ALONG_DEVICES, check_vma=False)(parts, whole)
 
 
 def everywhere(tree: Any) -> Any:

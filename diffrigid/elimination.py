@@ -23,7 +23,7 @@ from jax import Array, lax
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.gathers import rows
 
-ROUNDING = 1e2  # [-] times eps times the diagonal: where joints form loops, a pivot no larger counts as zero
+PIVOT_ROUNDING = 1e2  # [-] times eps times the diagonal: where joints form loops, a pivot no larger counts as zero
 
 
 class Level(NamedTuple):
@@ -51,7 +51,7 @@ class Plan(NamedTuple):
 
 
 @functools.cache
-def plan(ends: tuple[tuple[int, int], ...], moving: int) -> Plan:
+def plan_of(ends: tuple[tuple[int, int], ...], moving: int) -> Plan:
     """Make the plan for joints between these colliders; those from `moving` on are static, and couple nothing."""
     on = [{body for body in pair if body < moving} for pair in ends]
     graph = {i: {j for j in range(len(on)) if j != i and on[i] & on[j]} for i in range(len(on))}
@@ -66,8 +66,7 @@ def plan(ends: tuple[tuple[int, int], ...], moving: int) -> Plan:
         levels.append(level)
     solutions = [i for level in reversed(sets) for i in level]
     places = tuple(solutions.index(i) for i in range(len(on)))
-    grounded = [(min(a, moving), min(b, moving)) for a, b in ends]  # all statics count as one body
-    is_tree = len(ends) == moving + 1 - len(set(islands(grounded, moving + 1)))
+    is_tree = len(ends) == moving + 1 - len(set(islands(grounded(ends, moving), moving + 1)))
     return Plan(pairs=pairs, levels=tuple(levels), places=places, is_tree=is_tree)
 
 
@@ -125,8 +124,13 @@ def _level(pivots, blocks, left, later, first) -> tuple[Level, list, list]:
     return level, kept, kept_rows
 
 
+def grounded(ends: Iterable[tuple[int, int]], moving: int) -> list[tuple[int, int]]:
+    """The ends of pairs, all statics counted as one body."""
+    return [(min(a, moving), min(b, moving)) for a, b in ends]
+
+
 def islands(ends: Iterable[tuple[int, int]], moving: int) -> tuple[tuple[int, ...], ...]:
-    """Moving bodies connected with each moving body by joints with these ends, itself included."""
+    """Moving bodies connected with each moving body through pairs with these ends, itself included, in order."""
     together = [{body} for body in range(moving)]
     for a, b in ends:
         if a < moving and b < moving and together[a] is not together[b]:
@@ -145,7 +149,7 @@ class Factor(NamedTuple):
 
 def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
     """Factors of all levels, from blocks (n + pairs, E, E, *batch) of joints with themselves, then of `plan.pairs`."""
-    count, rounding = len(plan.places), 0.0 if plan.is_tree else ROUNDING * jnp.finfo(blocks.dtype).eps
+    count, rounding = len(plan.places), 0.0 if plan.is_tree else PIVOT_ROUNDING * jnp.finfo(blocks.dtype).eps
     tiny = rounding * jnp.stack([blocks[:count, e, e] for e in range(blocks.shape[1])], axis=1)
     factors, live = [], opaque_true(blocks)
     for level in plan.levels:

@@ -46,7 +46,7 @@ class Flight:
     jolt: Array | None = array("N", "D", default=None)  # [m/s^3]
     twist: Array | None = array("N", "A", default=None)  # [N m/s]
     carry: Array | None = array("N", "A", default=None)  # [rad/s] world axes; None: 2D, or torques
-    turn: Array = array("N", "K", "A")  # [rad/s, rad/s^2, ...] body axes
+    turn: Array = array("N", "K", "A")  # [rad/s, rad/s^2, ...] body axes; K terms of a series
     inverse_mass: Array = array("N")  # [1/kg]
     inverse_inertia: Array = array(lambda f: ("N",) if f.dim == 2 else ("N", "D", "D"))
     dim: int = static()

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jax import Array
 
+from diffrigid.elimination import islands
 from diffrigid.forces import total_wrench
 from diffrigid.hull import hull_faces
 from diffrigid.pytree import replace
@@ -30,6 +31,13 @@ from diffrigid.world import World
 
 SHOWN = 30  # impacts that are printed
 SLOP = 2e-3  # [-] of the smaller size: gap up to which bodies touch
+TOGETHER = 1e-2  # [-] of it: gap up to which other points take part in an impact
+STRUCK = 1e-5  # [-] of the impulse of the forces: a smaller change of momentum is none
+BEYOND, FASTER = (
+    1.1,
+    1.5,
+)  # [-] times the sizes, and the path at the first speed: others do not meet
+TINY = 1e-9  # [m, N s] where there is no size, no force
 WORK = 4_000_000  # pairs times intervals beyond which not all stored times are examined
 ROUGH = 5.0  # [-] an impulse that exceeds that of the forces in an interval by this factor is an impact
 
@@ -202,11 +210,11 @@ def _touches(world: World, group: Any, motion: Sampled, dp: np.ndarray, dL: np.n
     sides = _side(world, group.shape_a), _side(world, group.shape_b)
     a, b, rows = np.array(group.a), np.array(group.b), (np.array(group.row_a), np.array(group.row_b))
     h, size = np.diff(motion.t), np.minimum(sides[0].size[rows[0]], sides[1].size[rows[1]])
-    struck = np.linalg.norm(dp, axis=2) + np.linalg.norm(dL, axis=2) / max(size.min(), 1e-9) > 1e-5 * (push + 1e-9)
+    struck = np.linalg.norm(dp, axis=2) + np.linalg.norm(dL, axis=2) / max(size.min(), TINY) > STRUCK * (push + TINY)
     struck = np.concatenate([struck, np.zeros((len(struck), len(world.static_names)), bool)], axis=1)
     apart = np.linalg.norm(motion.x[:-1, a] - motion.x[:-1, b], axis=2)
     path = h[:, None] * np.linalg.norm(motion.v[:-1, a] - motion.v[:-1, b], axis=2)
-    reach = 1.1 * (sides[0].size[rows[0]] + sides[1].size[rows[1]]) + 1.5 * path
+    reach = BEYOND * (sides[0].size[rows[0]] + sides[1].size[rows[1]]) + FASTER * path
     k, pair = np.nonzero((struck[:, a] | struck[:, b]) & (apart < reach))
     slop, row_a, row_b = SLOP * size[pair], rows[0][pair], rows[1][pair]
 
@@ -220,7 +228,7 @@ def _touches(world: World, group: Any, motion: Sampled, dp: np.ndarray, dL: np.n
     new, meets = start.min(1, initial=np.inf) > slop, end.min(1, initial=np.inf) <= slop
     s = _meeting(at, h[k], new & meets)
     gap, point = at(s)
-    near = (gap <= (2 * slop + 1e-2 * size[pair] * new)[:, None]) & (
+    near = (gap <= (2 * slop + TOGETHER * size[pair] * new)[:, None]) & (
         gap <= gap.min(1, keepdims=True, initial=np.inf) + 4 * slop[:, None]
     )
     near &= meets[:, None] & (new[:, None] | (end <= slop[:, None]))
@@ -302,7 +310,7 @@ def _impulses(world: World, motion: Sampled, touch: Touch, dp: np.ndarray, dL: n
         arms = touch.point[rows] - motion.x[k][ends] - s[:, None] * motion.v[k][ends]
         joints = [_anchors(world, motion, k, group) for group in world.joints]
         all_ends, all_arms = (np.concatenate(parts, axis=1) for parts in zip((ends, arms), *joints, strict=True))
-        label = _islands(all_ends, moving)
+        label = np.array([bodies[0] for bodies in islands(all_ends.T.tolist(), moving)])
         island = label[all_ends.min(0)]  # statics have the larger numbers
         for number in np.unique(island[: rows.size]):
             bodies, chosen = np.flatnonzero(label == number), np.flatnonzero(island == number)
@@ -314,16 +322,6 @@ def _impulses(world: World, motion: Sampled, touch: Touch, dp: np.ndarray, dL: n
             contacts = chosen[chosen < rows.size]
             found[rows[contacts]] = (A.T @ lam).reshape(len(chosen), -1)[: len(contacts)]
     return found
-
-
-def _islands(ends: np.ndarray, moving: int) -> np.ndarray:
-    """Connected component of each moving body, through `ends` (2, C): the smallest index of the bodies in it."""
-    label, (a, b) = np.arange(moving), ends[:, (ends < moving).all(0)]
-    while (label[a] != label[b]).any():
-        least = np.minimum(label[a], label[b])
-        np.minimum.at(label, a, least)
-        np.minimum.at(label, b, least)
-    return label
 
 
 def _columns(ends: np.ndarray, arms: np.ndarray, moving: int, A: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from diffrigid.constraints import joint_rates, placed
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
 from diffrigid.joints import JOINTS, Distance, Pose, Revolute, separation
-from diffrigid.linkage import ends_of, to_sides
+from diffrigid.linkage import ends_of, to_sides, twists_of
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
 from diffrigid.shapes import traced
@@ -156,8 +156,7 @@ def warn_of_torn_joints(world: "World", state: State) -> None:
         parts = []
         for group in world.joints:
             at = placed((group,), world.statics, state.x, state.q)
-            twists = jnp.concatenate([state.v, state.w], axis=1)
-            rates = joint_rates(rotations(world.dim), at, to_sides(ends_of((group,)), twists))
+            rates = joint_rates(rotations(world.dim), at, to_sides(ends_of((group,)), twists_of(state)))
             parts.append(jnp.sqrt((rates**2).sum(1)))
         return jnp.concatenate(parts)
 

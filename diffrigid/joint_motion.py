@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.constraints import change, placed
-from diffrigid.elimination import islands
+from diffrigid.elimination import grounded, islands
 from diffrigid.joints import Pose, Prismatic, Revolute
-from diffrigid.linkage import ends_of, to_sides
+from diffrigid.linkage import ends_of, to_sides, twists_of
 from diffrigid.numerics import dot
 from diffrigid.pytree import replace
 from diffrigid.state import State, rotations
@@ -62,9 +62,9 @@ def moving_side(world: "World", name: str) -> tuple[int, tuple[int, ...]]:
 
 @functools.cache
 def _moving_side(ends: tuple[tuple[int, int], ...], index: int, moving: int) -> tuple[int, tuple[int, ...]]:
-    grounded = [(min(a, moving), min(b, moving)) for a, b in ends]  # one body for all statics
-    a, b = grounded[index]
-    sides = islands(grounded[:index] + grounded[index + 1 :], moving + 1)
+    pairs = grounded(ends, moving)
+    a, b = pairs[index]
+    sides = islands(pairs[:index] + pairs[index + 1 :], moving + 1)
     if b in sides[a]:
         return 0, ()
     side = 1 if moving in sides[a] else 0
@@ -84,7 +84,7 @@ class _At(NamedTuple):
 def _at(world: "World", state: State, name: str) -> _At:
     group, row = next((g, names.index(name)) for g, names in enumerate(world.joint_names) if name in names)
     (at,) = placed(world.joints[group : group + 1], world.statics, state.x, state.q)
-    twists = to_sides(ends_of(world.joints[group : group + 1]), jnp.concatenate([state.v, state.w], axis=1))
+    twists = to_sides(ends_of(world.joints[group : group + 1]), twists_of(state))
     joint, a, b = jax.tree.map(lambda leaf: leaf[row], tuple(at))
     return _At(joint, a, b, twists[row])
 

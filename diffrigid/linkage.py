@@ -31,7 +31,7 @@ from diffrigid.constraints import (
     of_each,
     placed,
 )
-from diffrigid.elimination import Factor, factorise, plan, substitute
+from diffrigid.elimination import Factor, factorise, plan_of, substitute
 from diffrigid.gathers import rows
 from diffrigid.joints import Pose
 from diffrigid.numerics import dot
@@ -54,7 +54,7 @@ class Linkage:
     sides: Array = array("n", "E", "2", "D + A")  # J, without derivative
     factors: tuple[Factor, ...] = ()  # of J M^-1 J^T, without derivative
     inverse_mass: Array = array("N")  # [1/kg]
-    inverse_inertia: Array = array("N")  # [1/(kg m^2)] world axes
+    inverse_inertia: Any = None  # [1/(kg m^2)] world axes
     ends: tuple[tuple[int, int], ...] = static()  # colliders a and b of every joint
 
 
@@ -67,7 +67,7 @@ def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> 
     sides = unfused(live, functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
     blocks = _blocks(so, ends, sides, *lax.stop_gradient((inverse_mass, inverse)))
     return Linkage(
-        groups=groups, sides=sides, factors=factorise(plan(ends, len(x)), blocks), inverse_mass=inverse_mass,
+        groups=groups, sides=sides, factors=factorise(plan_of(ends, len(x)), blocks), inverse_mass=inverse_mass,
         inverse_inertia=inverse, ends=ends,
     )  # fmt: skip
 
@@ -93,7 +93,7 @@ def _shared(ends: tuple[tuple[int, int], ...], moving: int) -> tuple:
     """For each pair of coupled joints, indices 2 i + s (side s of joint i) on a shared body; a table per such body."""
     found = [
         [(2 * i + s, 2 * j + t) for s in (0, 1) for t in (0, 1) if ends[i][s] == ends[j][t] < moving]
-        for i, j in plan(ends, moving).pairs
+        for i, j in plan_of(ends, moving).pairs
     ]
     most = max(map(len, found), default=0)
     return tuple(tuple(zip(*((some + [(-1, -1)])[k] for some in found), strict=True)) for k in range(most))
@@ -144,7 +144,7 @@ def _multipliers(link: Linkage, target: Array) -> Array:
         return _rates(link, _moved(link, _pull(link, lam)))
 
     def solve(_, right: Array) -> Array:
-        return substitute(plan(link.ends, len(link.inverse_mass)), link.factors, right)
+        return substitute(plan_of(link.ends, len(link.inverse_mass)), link.factors, right)
 
     return lax.custom_linear_solve(product, -target, solve, symmetric=True)
 
@@ -162,19 +162,19 @@ def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wren
     state = unfused(opaque_true(state.x), lambda state: state, state)  # else recomputed for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
-    given = _damped(joints, link, _twists(state), jnp.concatenate([wrench.F, torque], axis=1), span)
+    given = _damped(joints, link, twists_of(state), jnp.concatenate([wrench.F, torque], axis=1), span)
     gyroscopic = jax.vmap(so.gyroscopic)(bodies.inertia, state.q, state.w)
     free = _moved(link, given - jnp.pad(gyroscopic, [(0, 0), (so.D, 0), *[(0, 0)] * (given.ndim - 2)]))
 
     def falling(groups: tuple[PlacedJoints, ...], twists: Array, free: Array) -> Array:
         return joint_accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
 
-    target = unfused(opaque_true(state.x), falling, link.groups, _twists(state), free)
+    target = unfused(opaque_true(state.x), falling, link.groups, twists_of(state), free)
     forces = given + _pull(link, _multipliers(link, target))
     return Wrench(F=forces[:, : so.D], tau=forces[:, so.D :])
 
 
-def _twists(state: State) -> Array:
+def twists_of(state: State) -> Array:
     """Twists (v, w) of all bodies, (N, D + A, *batch)."""
     return jnp.concatenate([state.v, state.w], axis=1)
 
@@ -248,7 +248,7 @@ def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> St
     """
     state = unfused(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
-    off = jnp.stack([joint_errors(so, link.groups), _rates(link, _twists(state))])
+    off = jnp.stack([joint_errors(so, link.groups), _rates(link, twists_of(state))])
     moved, kicked = jax.vmap(lambda off: _moved(link, _pull(link, _multipliers(link, off))))(off)
     q = jax.vmap(so.turn_by)(moved[:, so.D :], state.q)
     return State(x=state.x + moved[:, : so.D], q=q, v=state.v + kicked[:, : so.D], w=state.w + kicked[:, so.D :])

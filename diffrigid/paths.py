@@ -40,7 +40,7 @@ UNITS = {
     "radius": "m", "half": "m", "half_length": "m", "vertices": "m", "points": "m", "offset": "m", "width": "m",
     "heights": "m", "spacing": "m",
     "linear": "N s/m", "quadratic": "N s^2/m^2", "angular": "N m s/rad", "stiffness": "N/m", "damping": "N s/m",
-    "length": "m",
+    "length": "m", "arm": "m", "slow": "m/s",
     "translation": "m", "F": "N", "tau": "N m", "point": "m", "anchor_a": "m", "anchor_b": "m", "rest_speed": "m/s",
     "restitution_falloff": "s/m", "rolling_friction": "m", "spinning_friction": "m",
 }  # fmt: skip
@@ -290,7 +290,6 @@ def _with_rows(leaf: Array, rows: Any, value: Numbers) -> Array:
 def _axes(record: Any, field: str, place: Place) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Shape of the value of a place in one world, and the batch axes that its leaf has behind it."""
     letters = letters_of(record, field)
-    letters = letters[0](record) if letters and callable(letters[0]) else letters
     rank = len(letters) - (letters[:1] in (("N",), ("S",)) and place.row is not None)
     shape = getattr(record, field).shape[place.row is not None :]
     return () if place.angle else shape[:rank], shape[rank:]

@@ -76,13 +76,10 @@ def map_arrays(fn, node, where: str = "", stack: tuple[str, ...] = ()):
         if field.metadata.get("static"):
             continue
         value, path = getattr(node, field.name), f"{where}.{field.name}"
-        letters = field.metadata.get("letters")
-        if letters is None:
+        if "letters" not in field.metadata:
             changed[field.name] = map_arrays(fn, value, path, stack + field.metadata.get("stacked", ()))
         elif value is not None:
-            # Axes may depend on the dimension, a static field of the record.
-            letters = letters[0](node) if letters and callable(letters[0]) else letters
-            changed[field.name] = fn(value, stack + letters, path)
+            changed[field.name] = fn(value, stack + letters_of(node, field.name), path)
     return replace(node, **changed)
 
 
@@ -126,5 +123,6 @@ def array_fields(record) -> list[str]:
 
 
 def letters_of(record, name: str) -> tuple:
-    """Letters of the axes of a float leaf, for one world."""
-    return next(field.metadata["letters"] for field in dataclasses.fields(record) if field.name == name)
+    """Letters of the axes of a float leaf, for one world. They may depend on the dimension, a static field."""
+    letters = next(field.metadata["letters"] for field in dataclasses.fields(record) if field.name == name)
+    return letters[0](record) if letters and callable(letters[0]) else letters

@@ -1,4 +1,4 @@
-"""`scene`: from bodies as users write them to `(World, State)`. All checks of values are made here."""
+"""`scene`: from bodies as users write them to `(World, State)`. All values are checked on the way."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass

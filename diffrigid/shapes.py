@@ -153,7 +153,7 @@ class HeightField:
         (1, 9, 9)
     """
 
-    heights: Leaf = array("R", "C")  # (R, C, *batch) [m], R and C >= 2
+    heights: Leaf = array("R", "C")  # (R, C, *batch) [m], R rows and C columns, 2 or more
     spacing: Leaf = array()  # (*batch) [m] > 0
     cells: int | None = static(None)  # how far to each side a body looks, in cells; None: `scene` finds it, if it can
 

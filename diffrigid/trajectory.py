@@ -27,7 +27,7 @@ class Trajectory:
     t: Array = array("T")  # (T+1,) [s], from 0, or the given times
     state: State
     world: World
-    controls: Any = None  # as given, over each interval
+    controls: Any = None  # of each interval, by name, as arrays
 
     def __getitem__(self, path: str) -> Array:
         """Value of a path at every time, (T+1, ...), or (B, T+1, ...) by `vmap` of `rollout`; see `diffrigid.paths`."""

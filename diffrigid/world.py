@@ -86,14 +86,14 @@ def axis_sizes(world: World) -> dict[str, int]:
 
 
 def check_kinds(world: Any, state: Any) -> None:
-    """Raise ValueError unless the arguments are (world, state)."""
+    """Raise ValueError unless the arguments are a world and a state, and the world has what its kind takes."""
     if not isinstance(world, World) or not isinstance(state, State):
         raise ValueError(
             f"expected (world, state), got ({type(world).__name__}, {type(state).__name__}): "
             "both come from `diffrigid.scene`, in this order."
         )
     if world.crowd and not traced(world.contact.width) and np.any(np.asarray(world.contact.width) > 0):
-        raise ValueError(f"contact.width is {world.contact.width}: expected 0 for so many bodies; use fewer than 256.")
+        raise ValueError(f"contact.width is {world.contact.width}: expected 0 for so many bodies; use fewer.")
     if world.crowd and (world.forces or world.joints):
         raise ValueError("world has forces or joints, but was made as a crowd without: give them to `scene`.")
     if not isinstance(world.bodies, Bodies):

@@ -11,6 +11,12 @@ DOWN = G * IMPACT  # [m/s] at the impact
 T = np.linspace(0.0, 0.9, 55)
 
 
+def sums(world, state):
+    """Momentum, angular momentum and kinetic energy of all bodies together."""
+    laws = dr.momentum, dr.angular_momentum, dr.kinetic_energy
+    return tuple(law(world.bodies, state).sum(0) for law in laws)
+
+
 def trajectory(world, t, x, q, v, w):
     state = dr.State(**{name: np.asarray(value, float) for name, value in dict(x=x, q=q, v=v, w=w).items()})
     return dr.Trajectory(t=np.asarray(t), state=state, world=world)

@@ -38,12 +38,12 @@ def box(count, seed=3, **options):
 @pytest.fixture
 def many(monkeypatch):
     """A few are many."""
-    monkeypatch.setattr(crowd, "MANY", 4)
+    monkeypatch.setattr(crowd, "CROWD", 4)
 
 
 def test_a_crowd_moves_as_all_pairs_do(monkeypatch):
     expected = dr.rollout(*box(20), dt=1 / 60, steps=STEPS).state
-    monkeypatch.setattr(crowd, "MANY", 4)
+    monkeypatch.setattr(crowd, "CROWD", 4)
     world, state = box(20)
     assert world.crowd and not world.pairs
     found = dr.rollout(world, state, dt=1 / 60, steps=STEPS).state

@@ -40,7 +40,8 @@ def test_energy_and_momentum_are_those_of_the_closed_form(ax):
     np.testing.assert_allclose(total[-1, 1] - total[0, 1], -MASS * DOWN**2 / 2 * (1 - E**2), atol=1e-9)
     p = lines(view.momentum(run, ax=ax))["y"]
     np.testing.assert_allclose(p[:, 1], MASS * np.where(T < IMPACT, -G * T, E * DOWN - G * (T - IMPACT)), atol=1e-9)
-    assert lines(view.momentum(bounce(3), angular=True, ax=ax))["z"].shape == (55, 2)
+    L = lines(view.momentum(bounce(3, spin=3.0), angular=True, ax=ax))["z"]
+    np.testing.assert_allclose(L[:, 1], 0.4 * MASS * RADIUS**2 * 3.0, rtol=1e-9)
 
 
 def test_phase_is_velocity_against_position(ax):

@@ -1,12 +1,13 @@
 """Conservation laws and symmetries, in two and three dimensions."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_form import bouncing, disc_and_plane, final, made, simulated, steps_near, two_discs, vector
+from motions import sums
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -73,13 +74,8 @@ def crowds(dim):
 
     def one(p):
         world, state = crowd(p)
-
-        def sums(state):
-            laws = dr.momentum, dr.angular_momentum, dr.kinetic_energy
-            return tuple(law(world.bodies, state).sum(0) for law in laws)
-
         states = dr.rollout(world, state, dt=1 / 60, steps=90).state
-        return states, *jax.vmap(sums)(states)
+        return states, *jax.vmap(partial(sums, world))(states)
 
     return jax.jit(lambda p: jax.lax.map(one, p))(starts(dim))
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_form import vector, with_slopes
+from motions import sums
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -153,10 +154,6 @@ def test_energy_falls_and_momenta_are_kept(dim):
         b = dr.Body(other, mass=0.8, x=1.2 * np.eye(dim)[0], v=-1.0 * np.eye(dim)[0], w=-0.5 * w)
         kinds = {"rolling_friction": 0.03} | ({} if dim == 2 else {"spinning_friction": 0.02})
         return dr.scene({"a": a, "b": b}, restitution=e, friction=0.4, **kinds)
-
-    def sums(world, state):
-        laws = dr.momentum, dr.angular_momentum, dr.kinetic_energy
-        return tuple(law(world.bodies, state).sum(0) for law in laws)
 
     worlds, states = jax.vmap(scene)(jnp.array([0.0, 0.6, 0.6]), jnp.array([2.0, 2.0, -4.0]))
     path = dr.rollout_batch(worlds, states, dt=1 / 60, steps=45)

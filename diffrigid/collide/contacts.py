@@ -1,5 +1,8 @@
 """The record that every pair function returns."""
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from diffrigid.pytree import array, pytree
@@ -16,3 +19,22 @@ class Contacts:
     gap: Array = array("K")  # (K, *batch) [m] signed distance, negative in penetration
     normal: Array = array("K", "D")  # (K, D, *batch) [-] unit, from b to a
     point: Array = array("K", "D")  # (K, D, *batch) [m] midway between the two surfaces
+
+
+def joined(*parts: Contacts) -> Contacts:
+    """One list of several."""
+    return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
+
+
+def slack_of(size: Array) -> Array:
+    """Distance within which two features of shapes of this size coincide, sqrt(rounding) of it, (*batch) [m]."""
+    return _share(size) * size
+
+
+def size_of(slack: Array) -> Array:
+    """Size of the shapes that have this slack, (*batch) [m]."""
+    return slack / _share(slack)
+
+
+def _share(like: Array) -> np.floating:
+    return np.sqrt(np.finfo(like.dtype).eps).astype(like.dtype)

@@ -6,10 +6,9 @@ face that lands flat touches with all its vertices and crossings, and each is a 
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
-from diffrigid.collide.contacts import Contacts
+from diffrigid.collide.contacts import Contacts, joined, slack_of
 from diffrigid.collide.distance import core_distance
 from diffrigid.collide.edges import crossing_edges
 from diffrigid.numerics import dot, norm
@@ -27,14 +26,14 @@ def convex_convex(a, x_a: Array, q_a: Array, b, x_b: Array, q_b: Array) -> Conta
         parts.append(_corners_against(corners_a, radius(a), b, x_b, q_b, slack))
     if not isinstance(a, Disc | Sphere):
         parts.append(_flip(_corners_against(corners_b, radius(b), a, x_a, q_a, slack)))
-    contacts = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
+    contacts = joined(*parts)
     if dim == 2 or not edges(a, dim) or not edges(b, dim):
         return contacts
     rounding = radius(a) + radius(b)
     separated = _separates(parts[0], corners_a, rounding, slack)
     separated = separated | _separates(_flip(parts[1]), corners_b, rounding, slack)
     crossings = crossing_edges(a, corners_a, b, corners_b, contacts, separated, slack)
-    return jax.tree.map(lambda *rows: jnp.concatenate(rows), contacts, crossings)
+    return joined(contacts, crossings)
 
 
 def _placed(shape, x: Array, q: Array) -> Array:
@@ -44,13 +43,12 @@ def _placed(shape, x: Array, q: Array) -> Array:
 
 
 def _slack(corners_a: Array, round_a: Array, corners_b: Array, round_b: Array) -> Array:
-    """Distance within which two features coincide, sqrt(rounding) of the smaller size, (*batch) [m]."""
+    """Distance within which two features coincide, by the smaller size, (*batch) [m]."""
 
     def size(corners, rounding):
         return jax.vmap(norm)(corners - corners.mean(0)[None]).max(0) + rounding
 
-    smaller = lax.stop_gradient(jnp.minimum(size(corners_a, round_a), size(corners_b, round_b)))
-    return np.sqrt(np.finfo(smaller.dtype).eps).astype(smaller.dtype) * smaller
+    return slack_of(lax.stop_gradient(jnp.minimum(size(corners_a, round_a), size(corners_b, round_b))))
 
 
 def _corners_against(corners: Array, rounding: Array, b, x_b: Array, q_b: Array, slack: Array) -> Contacts:

@@ -12,13 +12,13 @@ and not one of rounding. `slack` (*batch) [m] is the distance within which p is 
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
-from diffrigid.collide.contacts import ALERT
+from diffrigid.collide.contacts import ALERT, size_of
 from diffrigid.gathers import first_highest, rows
 from diffrigid.numerics import dot, norm, normalise, unit_vector
 from diffrigid.shapes import Box, Capsule, Disc, Hull, Polygon, Sphere, radius, vertices
+from diffrigid.so2 import perp
 from diffrigid.so3 import cross
 
 
@@ -63,7 +63,7 @@ def polygon_distance(shape: Polygon, p: Array, inward: Array, slack: Array) -> t
     edge = jnp.roll(start, -1, axis=0) - start
     length = jax.vmap(norm)(edge)
     along = edge / length[:, None]
-    outward = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
+    outward = -jax.vmap(perp)(along)
     dots = jax.vmap(dot, in_axes=(0, None))
     height, facing = jax.vmap(dot)(outward, p[None] - start), dots(outward, inward)
     best = jnp.argmax(_reachable(height, facing, slack), axis=0)
@@ -128,7 +128,7 @@ def _alerted(distance: Array, at: Array, several: Array, slack: Array) -> Array:
         at: (F, *batch) bool: faces in whose plane it is, with its body in front of them.
         several: (*batch) bool: it is also outside another face, or in the planes of several.
     """
-    alert = ALERT / float(np.sqrt(np.finfo(slack.dtype).eps)) * slack  # of the size that `slack` belongs to
+    alert = ALERT * size_of(slack)
     return jnp.where(at.any(0) & several, jnp.maximum(distance, lax.stop_gradient(alert)), distance)
 
 

@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from diffrigid import so3
-from diffrigid.collide.contacts import FAR, Contacts
+from diffrigid.collide.contacts import FAR, Contacts, size_of
 from diffrigid.gathers import rows
 from diffrigid.numerics import dot, norm, normalise, unit_vector
 from diffrigid.shapes import Capsule, edge_apexes, edges, radius
@@ -115,7 +114,7 @@ def are_outermost(c: Crossing, deepest: Array, slack: Array) -> Array:
     They are so but for a dip where one face comes down on another beside a corner that is inside by more: the one with
     the least gap, `deepest` [m].
     """
-    dip = jnp.where(c.distance >= deepest, DIP / np.sqrt(np.finfo(slack.dtype).eps), 1.0).astype(slack.dtype) * slack
+    dip = jnp.where(c.distance >= deepest, DIP * size_of(slack), slack)
     return c.lowest >= -dip
 
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.collide.contacts import ALERT, FAR, Contacts
+from diffrigid.collide.contacts import ALERT, FAR, Contacts, joined, slack_of
 from diffrigid.collide.distance import core_distance, reach
 from diffrigid.collide.edges import CROSSINGS, Edges, are_outermost, crossing, edges_of
 from diffrigid.numerics import components, dot, norm, normalise, safe_divide
@@ -99,7 +99,7 @@ def _contacts(
         searched: with features that may be met within the step, but do not touch yet.
     """
     so, size = rotations(3), lax.stop_gradient(reach(a, 3))
-    slack = np.sqrt(np.finfo(size.dtype).eps).astype(size.dtype) * size
+    slack = slack_of(size)
     alert = ALERT * size if searched else jnp.full_like(size, FAR)
     middle = so.unrotate(q_b, x_a - x_b)
     corners = jax.vmap(lambda r: middle + so.unrotate(q_b, so.rotate(q_a, r)))(vertices(a, 3))
@@ -108,7 +108,7 @@ def _contacts(
     def touching(p: Array) -> Contacts:
         around, rounding = _around(b, p, cells), radius(a)
         parts = _faces(around, slack, alert, rounding), _edges(around, slack, rounding), _tops(around, slack, rounding)
-        return some(_moved(_joined(*parts), p), TOUCHES, slack)
+        return some(_moved(joined(*parts), p), TOUCHES, slack)
 
     c = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), jax.vmap(touching)(corners))
     if not isinstance(a, Sphere):
@@ -124,7 +124,7 @@ def _contacts(
         deepest = lax.stop_gradient(c.gap.min(0)) + radius(a)
         own = edges_of(a, corners - middle[None])
         ridges = _nearest(_ridges(own, around, deepest, size, slack, radius(a)), count, None)
-        c = _joined(c, _moved(_joined(peaks, ridges), middle))
+        c = joined(c, _moved(joined(peaks, ridges), middle))
     normal, point = (jax.vmap(lambda r: so.rotate(q_b, r))(r) for r in (c.normal, c.point))
     return Contacts(gap=c.gap, normal=normal, point=point + x_b[None])
 
@@ -132,10 +132,6 @@ def _contacts(
 def _cells_of_corners(a, b: HeightField) -> Any:
     """Number of cells to each side of a corner that are looked up; static."""
     return b.cells if isinstance(a, Sphere | Capsule) else 1
-
-
-def _joined(*parts: Contacts) -> Contacts:
-    return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
 
 
 def _moved(c: Contacts, p: Array) -> Contacts:

@@ -16,13 +16,13 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
-from diffrigid.collide.contacts import ALERT, FAR, Contacts
+from diffrigid.collide.contacts import ALERT, FAR, Contacts, joined, slack_of
 from diffrigid.collide.distance import core_distance, reach
 from diffrigid.numerics import dot, norm, normalise
 from diffrigid.shapes import Disc, Profile, radius, vertices
+from diffrigid.so2 import moment, perp
 from diffrigid.state import rotations
 
 STRAIGHT = 1e-4  # [-] 1 - cosine of two segments, below which a body moves along them as along one
@@ -44,7 +44,7 @@ def convex_profile(a, x_a: Array, q_a: Array, b: Profile, x_b: Array, q_b: Array
             return gap, so.unrotate(q_b, so.rotate(q_a, n))
 
         parts.append(_vertex_contacts(b, distance, radius(a), slack, alert))
-    c = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
+    c = joined(*parts)
     normal, point = (jax.vmap(lambda r: so.rotate(q_b, r))(r) for r in (c.normal, c.point))
     return Contacts(gap=c.gap, normal=normal, point=point + x_b[None])
 
@@ -54,7 +54,7 @@ def on_next_segments(a, b: Profile, rests: Array) -> Array:
 
     So a body that slides or rolls from one segment to the next is held there as before, and does not strike it.
     """
-    up = lax.stop_gradient(_up(_segments(b)[1]))
+    up = lax.stop_gradient(jax.vmap(perp)(_segments(b)[1]))
     count = len(vertices(a, 2)) * len(up)
     on = rests[:count].reshape(-1, len(up), *rests.shape[1:])
     mean = jax.vmap(normalise)(jnp.where(on[:, :, None], up[None], 0.0).sum(1))
@@ -68,14 +68,14 @@ def clearance(b: Profile, p: Array) -> Array:
     share = jax.vmap(dot)(along, p[None] - start)
     low, high = _beyond(share, length)
     off = jnp.maximum(jnp.maximum(low, high), 0.0)
-    height = jax.vmap(dot)(_up(along), p[None] - start)
+    height = jax.vmap(dot)(jax.vmap(perp)(along), p[None] - start)
     return jnp.where(_inside(b, p), 0.0, jnp.sqrt(height**2 + off**2).min(0))
 
 
 def _lengths(a) -> tuple[Array, Array]:
     """Slack, the distance within which features coincide, and the least gap by ALERT, (*batch) [m]."""
     size = lax.stop_gradient(reach(a, 2))
-    return np.sqrt(np.finfo(size.dtype).eps).astype(size.dtype) * size, ALERT * size
+    return slack_of(size), ALERT * size
 
 
 def _segments(b: Profile) -> tuple[Array, Array, Array, Array]:
@@ -83,10 +83,6 @@ def _segments(b: Profile) -> tuple[Array, Array, Array, Array]:
     start, end = b.points[:-1], b.points[1:]
     length = jax.vmap(norm)(end - start)
     return start, (end - start) / length[:, None], end, length
-
-
-def _up(along: Array) -> Array:
-    return jnp.stack([-along[:, 1], along[:, 0]], axis=1)
 
 
 def _beyond(share: Array, length: Array) -> tuple[Array, Array]:
@@ -99,7 +95,7 @@ def _beyond(share: Array, length: Array) -> tuple[Array, Array]:
 def _inside(b: Profile, p: Array) -> Array:
     """Whether a point (2, *batch) is below the polyline."""
     start, along, _, _ = _segments(b)
-    height = jax.vmap(dot)(_up(along), p[None] - start)
+    height = jax.vmap(dot)(jax.vmap(perp)(along), p[None] - start)
     nowhere = jnp.full_like(height[:1], jnp.inf)
     x = b.points[1:-1, 0] + jnp.zeros_like(height[1:])
     over = (p[0][None] >= jnp.concatenate([-nowhere, x])) & (p[0][None] < jnp.concatenate([x, nowhere]))
@@ -109,7 +105,7 @@ def _inside(b: Profile, p: Array) -> Array:
 def _corner_contacts(b: Profile, p: Array, rounding: Array, slack: Array, alert: Array) -> Contacts:
     """Contacts of one corner with all segments, (S, ...), in the profile's axes."""
     start, along, end, length = _segments(b)
-    up = _up(along)
+    up = jax.vmap(perp)(along)
     height, share = (jax.vmap(dot)(r, p[None] - start) for r in (up, along))
     before, after = _beyond(share, length)
     # `slack`: values that are computed twice may be rounded differently.
@@ -161,7 +157,7 @@ def _shifted(flags: Array) -> Array:
 def _vertex_contacts(b: Profile, distance_of, rounding: Array, slack: Array, alert: Array) -> Contacts:
     """Contacts of the inner vertices with the core of a body, (S - 1, ...), in the profile's axes."""
     _, along, _, length = _segments(b)
-    up = _up(along)
+    up = jax.vmap(perp)(along)
 
     def one(p, along_0, along_1, up_0, up_1, size):
         inward = lax.stop_gradient(-size[None] * (up_0 + up_1))
@@ -177,4 +173,4 @@ def _vertex_contacts(b: Profile, distance_of, rounding: Array, slack: Array, ale
 
 
 def _cross(a: Array, b: Array) -> Array:
-    return a[0] * b[1] - a[1] * b[0]
+    return moment(a, b)[0]

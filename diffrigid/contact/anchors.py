@@ -3,7 +3,7 @@
 from jax import Array
 
 from diffrigid.flight import Flight, angular_momentum, position, velocity
-from diffrigid.pytree import Leaf, array, pytree
+from diffrigid.pytree import array, pytree
 from diffrigid.state import State, rotations
 
 
@@ -12,8 +12,8 @@ class Anchors:
     """Every body at its own time, the start of the step or its latest impact."""
 
     state: State
-    t0: Leaf = array("N")  # [s]
-    since: Leaf = array("N")  # [s] earliest time for which the path from here holds; before 0: late impacts
+    t0: Array = array("N")  # [s]
+    since: Array = array("N")  # [s] earliest time for which the path from here holds; before 0: late impacts
 
 
 def struck(f: Flight, t: Array, q: Array, dv: Array, dL: Array) -> State:

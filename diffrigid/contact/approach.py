@@ -19,7 +19,7 @@ from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.shapes import HeightField
 from diffrigid.state import rotations
 
-ROUNDING = 1e5  # [-] times eps times the near distance: gap that rounding of positions may leave at touching bodies
+TOUCH_ROUNDING = 1e5  # [-] times eps times the near distance: gap that rounding may leave at touching bodies
 
 
 class Task(NamedTuple):
@@ -57,7 +57,7 @@ def if_smooth(width: Array | None, smooth, exact, *args: Array) -> Any:
 
 def rounding(near: Array) -> Array:
     """Gap [m] that rounding of positions may leave at touching bodies, by the distance that is near."""
-    return ROUNDING * jnp.finfo(near.dtype).eps * near
+    return TOUCH_ROUNDING * jnp.finfo(near.dtype).eps * near
 
 
 def touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array:

@@ -43,6 +43,11 @@ def turning(spin: Array, values: Array) -> Array:
     return values[len(spin) : 2 * len(spin)]
 
 
+def without_turning(count: int, values: Array) -> Array:
+    """Entries of `values` without those for `count` rolling rows."""
+    return jnp.concatenate([values[:count], values[2 * count :]])
+
+
 def loaded(cone: Cone, normal: Array, z_n: Array, bound: Array) -> tuple[Array, Array]:
     """Normal impulses and tangential bounds, those of rolling rows set by the normal impulses of their contacts."""
     if cone.spin is None:

@@ -25,10 +25,11 @@ from diffrigid.contact.impact import approach
 from diffrigid.contact.impulse import impulses
 from diffrigid.contact.materials import Material, law, materials
 from diffrigid.contact.sides import Side
+from diffrigid.contact.slots import slots_of
 from diffrigid.contact.strikes import next_strikes
 from diffrigid.flight import launch, orientation, state_at
 from diffrigid.gathers import rows
-from diffrigid.numerics import FOUND, dot, norm
+from diffrigid.numerics import FOUND, dot, norm, saving
 from diffrigid.pytree import map_arrays, pytree, replace
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State, rotations
@@ -36,8 +37,7 @@ from diffrigid.state import State, rotations
 if TYPE_CHECKING:
     from diffrigid.world import World
 
-MANY = 256  # bodies, the least for which this way is taken
-SHARE = 8  # bodies per slot of a round
+CROWD = 256  # bodies, the least for which this way is taken
 ROUNDS = 4  # per sweep
 ROUNDING = 64  # [-] times eps times the speeds: slower closing counts as none
 SLOW = 1e-3  # [-] of `rest_speed`, likewise: else sticking bodies would take all rounds
@@ -53,7 +53,7 @@ def is_many(kinds: Any, owners: Any, moving: int, alone: bool) -> bool:
     """
     entries = [entry for entry, of in enumerate(owners) for owner in of if owner < moving]
     one_each = len(entries) == moving and len(set(entries)) == 1
-    return moving >= MANY and alone and one_each and set(kinds) <= {HalfSpace, Disc, Sphere}
+    return moving >= CROWD and alone and one_each and set(kinds) <= {HalfSpace, Disc, Sphere}
 
 
 @pytree
@@ -178,7 +178,7 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
     """Anchors after all rounds; rounds that no world needs are skipped."""
 
     # For reverse mode a round is cheaper to recompute than to save, except for its search (FOUND).
-    @functools.partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
+    @saving(FOUND)
     def one_round(anchors: Anchors) -> tuple[Anchors, Array]:
         flight = jax.tree.map(lambda leaf: leaf[0], launch(crowd.world, anchors.state, None, anchors.t0, crowd.dt))
         bodies = Side(flight=flight, since=anchors.since[0], shape=crowd.shape)
@@ -227,7 +227,7 @@ def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Encount
     back = pick(other, jnp.minimum(other, count - 1))
     lead = (first < jnp.inf) & ((other >= count) | ((back == me) & (me < other)))
     ranks = jnp.cumsum(lead.astype(jnp.int32))
-    slot = lax.broadcasted_iota(jnp.int32, (-(-count // SHARE),), 0)
+    slot = lax.broadcasted_iota(jnp.int32, (slots_of(count),), 0)
     a = jnp.minimum(jnp.searchsorted(ranks, slot + 1).astype(jnp.int32), count - 1)
     return Encounters(a, pick(other, a), slot < ranks[-1])
 

@@ -65,7 +65,7 @@ def _gaps_of_corners(a: Side, at: Placed, b: Side) -> Gaps:
     return Gaps(height, rate, acceleration, None)
 
 
-def deepest(gap: Array) -> Array:
+def least_of(gap: Array) -> Array:
     """1 for the smallest of the gaps (K, *batch), else 0."""
     return jax.nn.one_hot(jnp.argmin(gap, 0), len(gap), axis=0, dtype=gap.dtype)
 

@@ -23,7 +23,7 @@ from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
 from diffrigid.contact.impulse import comes_to_rest, restitution_at
 from diffrigid.contact.materials import materials, mixed
 from diffrigid.contact.sides import Side
-from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, sum_of_terms, summed
+from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, slots_of, sum_of_terms, summed
 from diffrigid.contact.strikes import is_rolling, relative_path_is_straight
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 RESTS = -1e30  # [s] marks an impact after which the bodies stay together
 CROWDED = 4  # pairs per body from which this way is faster than the list of pairs
-SHARE = 8  # bodies for each slot of a round
 ROUNDS = 3  # at most, for the impacts of a pass; most passes need one, and reverse mode pays for each
 
 
@@ -158,11 +157,6 @@ def meet_in_rounds(
 
     begins = constant(tuple(float(count * k) for k in range(ROUNDS)), str(dt.dtype))
     return lax.scan(one_round, anchors, begins)[0]
-
-
-def slots_of(moving: int) -> int:
-    """Number of slots of a round."""
-    return -(-moving // SHARE)
 
 
 def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Array, live: Array) -> Slots:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.branches import any_world
-from diffrigid.contact.cone import put, split, turning
+from diffrigid.contact.cone import put, split, turning, without_turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.slipping import in_all, least_slip, most_resisting, rubbing, slips
@@ -41,7 +41,7 @@ class Known:
         """Whether a gap of a world is open, by more than rounding, where a contact carries a load, (*batch) bool."""
         gap = strikes.gap - strikes.rounding
         turning_rows = len(self.P) - len(gap)
-        P = jnp.concatenate([self.P[:turning_rows], self.P[2 * turning_rows :]]) if turning_rows else self.P
+        P = without_turning(turning_rows, self.P) if turning_rows else self.P
         return ((gap > 0) & (P != 0).any(1)).any(0)
 
     def there(self, strikes: Strikes) -> "Known":

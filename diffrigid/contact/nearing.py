@@ -13,13 +13,13 @@ from jax import Array, lax
 
 from diffrigid.branches import choose
 from diffrigid.contact.approach import Task, angular_speed
-from diffrigid.contact.gaps import Gaps, deepest
+from diffrigid.contact.gaps import Gaps, least_of
 from diffrigid.numerics import safe_divide, safe_sqrt, softplus
 
 LOOKS = 48  # evaluations of the gaps, at most
 FIRST = 0.25  # [-] of the step: the first step forward
 TURN = 0.5  # [rad] largest relative rotation of the two in one step forward
-DEEP = 40.0  # [-] of the width: a deeper hit is exact to rounding
+EXACT_BEYOND = 40.0  # [-] of the width: a hit as much deeper is exact to rounding, by exp(-40)
 
 
 class Look(NamedTuple):
@@ -81,7 +81,7 @@ def level_at(closing: Look, opening: Look, width: Array) -> Array:
 
 def look_at(t: Array, gaps: Gaps) -> Look:
     """The least of the gaps at t (*batch) [s]."""
-    chosen = lax.stop_gradient(deepest(gaps.gap))
+    chosen = lax.stop_gradient(least_of(gaps.gap))
     return Look(t, (chosen * gaps.gap).sum(0), (chosen * gaps.rate).sum(0))
 
 
@@ -111,7 +111,7 @@ def nearer(task: Task, now: Nearing, gaps: Gaps) -> Nearing:
     following = jnp.where(between, root, jnp.where(closes, now.t + step, task.start))
     # Without an impact by the end of the step, a gap that shrinks by more than a width reaches its level later.
     later = jnp.where(first, jnp.where(now.t < task.t1, -jnp.inf, here.gap - task.width), now.later)
-    deep = (jnp.maximum(here.gap, 0.0) < later) | (here.gap < -DEEP * task.width)
+    deep = (jnp.maximum(here.gap, 0.0) < later) | (here.gap < -EXACT_BEYOND * task.width)
     opens = ~between & ~closes & (now.t <= task.start)
     ends = deep | opens | (between & (opening.t - closing.t <= 2.0 * within)) | (now.looks >= LOOKS)
     after = Nearing(

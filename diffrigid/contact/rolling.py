@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.contact.cone import put, split, turning
+from diffrigid.contact.cone import put, split, turning, without_turning
 from diffrigid.contact.impulse import sticking_impulse
 from diffrigid.contact.mobility import Mobility, moved
 from diffrigid.contact.resting import Law, Strikes
@@ -63,7 +63,7 @@ def with_rows(
         now=strikes.now[:count], held=strikes.held[:count],
     )  # fmt: skip
     strikes = replace(
-        jax.tree.map(partial(_behind, count), replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None), rows),
+        jax.tree.map(partial(_behind, count), _arrays(strikes), rows),
         a=a + a + strikes.a[count:], b=b + b + strikes.b[count:], jac=strikes.jac, mid_jac=strikes.mid_jac, spin=spin,
         wholes=own + tuple(("turn", *label) for label in own) + strikes.wholes[count:],
     )  # fmt: skip
@@ -118,9 +118,13 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: A
 def rows_of(strikes: Strikes) -> Strikes:
     """The rolling rows alone."""
     spin, count = strikes.spin, len(strikes.spin)
-    plain = replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None, spin=None)
     a, b, wholes = (of_all[:count] for of_all in (strikes.a, strikes.b, strikes.wholes))
-    return replace(jax.tree.map(partial(turning, spin), plain), a=a, b=b, wholes=wholes)
+    return replace(jax.tree.map(partial(turning, spin), _arrays(strikes)), a=a, b=b, wholes=wholes)
+
+
+def _arrays(strikes: Strikes) -> Strikes:
+    """Only what each contact and row has for itself."""
+    return replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None, spin=None)
 
 
 def _about(n: Array, r: Array) -> Array:
@@ -158,10 +162,9 @@ def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array
     pull = strikes.pull + by_torque / jnp.where(T > 0, T, 1.0)[:, None]
 
     def others(values: Any) -> Any:
-        return jax.tree.map(lambda leaf: jnp.concatenate([leaf[:count], leaf[2 * count :]]), values)
+        return jax.tree.map(partial(without_turning, count), values)
 
-    plain = replace(strikes, a=(), b=(), wholes=(), jac=None, mid_jac=None, spin=None)
-    free = others(replace(plain, v_rel=strikes.v_rel + by_torque, pull=pull))
+    free = others(replace(_arrays(strikes), v_rel=strikes.v_rel + by_torque, pull=pull))
     a, b, wholes = (of_all[:count] + of_all[2 * count :] for of_all in (strikes.a, strikes.b, strikes.wholes))
     free = replace(free, a=a, b=b, wholes=wholes)
     early = stopping_early(mobility, free, others(P), others(law), others(T), rest_speed)

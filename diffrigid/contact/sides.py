@@ -22,7 +22,7 @@ from diffrigid.state import rotations
 if TYPE_CHECKING:
     from diffrigid.world import World
 
-ROUNDING = 1e2  # [-] times eps times (size + a tenth of the coordinates): accuracy to which gaps are known
+GAP_ROUNDING = 1e2  # [-] times eps times (size + a tenth of the coordinates): accuracy to which gaps are known
 
 
 @pytree
@@ -226,4 +226,4 @@ def smaller_size(a: Side, b: Side) -> Array:
 def gap_rounding(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Array:
     """Accuracy to which gaps between two colliders are known, (*batch) [m]."""
     far = smaller_size(a, b) + 0.1 * lax.stop_gradient(jnp.abs(at_a.x).max(0) + jnp.abs(at_b.x).max(0))
-    return ROUNDING * jnp.finfo(far.dtype).eps * far
+    return GAP_ROUNDING * jnp.finfo(far.dtype).eps * far

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from diffrigid.world import World
 
 
+SHARE = 8  # bodies for each slot
+
+
 class Table(NamedTuple):
     """Pairs of one kind: all N bodies against each other, or against B statics."""
 
@@ -45,6 +48,11 @@ class Slots(NamedTuple):
 
     a: Array  # (E, N, *batch) body a
     b: tuple[Array, ...]  # for each table (E, N or B, *batch) the other side; all 0 if the slot is not of its kind
+
+
+def slots_of(moving: int) -> int:
+    """Number of slots for the impacts of so many bodies."""
+    return -(-moving // SHARE)
 
 
 class Blow(NamedTuple):
@@ -73,21 +81,10 @@ def meet(world: "World", tables: tuple[Table, ...], slots: Slots, anchors: Ancho
         strike = jax.tree.map(lambda leaf: leaf[:, 0], replace(strike, gap=None, press=None, pull=None, drift=None))
         return Blow(summed(there) * strike.active.astype(dt.dtype), strike, *law(own, others, strike))
 
-    def impulse(blows: list[Blow]) -> tuple:
-        one, *others = blows
-        for other in others:
-            one = jax.tree.map(functools.partial(_where, other.on > 0), other, one)
-        on, k, e, mu = one
-        P = impulses(on > 0, k.K, k.normal, k.v_rel, -e * jax.vmap(dot)(k.normal, k.v_rel), mu)
-        return on, k.s, P, k.arm_a, k.arm_b
-
     def end(columns: list, t: Array, P: Array, arm: Array) -> tuple:
         f = unpack(columns)[0].flight
         q = jax.vmap(orientation)(f, t)
         return jax.vmap(struck)(f, t, q, f.inverse_mass[:, None] * P, jax.vmap(so.moment)(arm, P)), t
-
-    def put(weights: Array, columns: list) -> list:
-        return [_weighted_sum(weights, column, 0) for column in columns]
 
     blows = []
     for table, there in zip(tables, slots.b, strict=True):
@@ -97,18 +94,28 @@ def meet(world: "World", tables: tuple[Table, ...], slots: Slots, anchors: Ancho
             static, unpack_static = pack(_static(world, table, flight, anchors.since), dt.ndim)
             static = _pick(live, there, static)
             blows.append(unfused(live, functools.partial(blow, unpack_static), columns_a, static, there))
-    on, t, P, arm_a, arm_b = unfused(live, impulse, blows)
+    on, t, P, arm_a, arm_b = unfused(live, _impulses, blows)
     if movers:
         on, t, P, arm = (jnp.concatenate(pair) for pair in ((on, on), (t, t), (P, -P), (arm_a, arm_b)))
     else:
         arm = arm_a
     after, unpack_after = pack(unfused(live, end, columns, t, P, arm), dt.ndim)
     weights = unfused(live, lambda weights, on: weights * on[:, None], weights, on)
-    state, t = unpack_after(unfused(live, put, weights, after))
+    state, t = unpack_after(unfused(live, _put, weights, after))
     hit = fold(jnp.add, weights, 0) > 0
     old = (anchors.state, anchors.t0, anchors.since)
     state, t0, since = jax.tree.map(functools.partial(_where, hit), (state, t, t), old)
     return Anchors(state=state, t0=t0, since=since)
+
+
+def _impulses(blows: list[Blow]) -> tuple:
+    """Whether there is an impact in each slot, (E, *batch), its time, impulse (E, D, *batch) [N s] and both arms."""
+    one, *others = blows
+    for other in others:
+        one = jax.tree.map(functools.partial(_where, other.on > 0), other, one)
+    on, k, e, mu = one
+    P = impulses(on > 0, k.K, k.normal, k.v_rel, -e * jax.vmap(dot)(k.normal, k.v_rel), mu)
+    return on, k.s, P, k.arm_a, k.arm_b
 
 
 def _static(world: "World", table: Table, flight: Flight, since: Array) -> tuple:
@@ -143,6 +150,11 @@ def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
 
     weights = unfused(live, filled, weights, unfused(live, summed, weights))
     return unfused(live, pick, weights, columns)
+
+
+def _put(weights: Array, columns: list[Array]) -> list[Array]:
+    """For each of A rows, what the slots whose weight (E, A, *batch) is 1 have for it; 0 if none."""
+    return [_weighted_sum(weights, column, 0) for column in columns]
 
 
 def _weighted_sum(weights: Array, values: Array, axis: int) -> Array:

@@ -18,6 +18,7 @@ from diffrigid.contact.impact import find_impact
 from diffrigid.contact.impulse import effective_matrix
 from diffrigid.contact.levers import acceleration, by_spin, levers, with_rates
 from diffrigid.contact.materials import material, mixed
+from diffrigid.contact.nearing import EXACT_BEYOND
 from diffrigid.contact.order import Links, Meeting, in_order
 from diffrigid.contact.resting import Strikes, are_alone
 from diffrigid.contact.sides import (
@@ -65,7 +66,7 @@ def find_strikes(
     meetings = [jax.vmap(lambda a, b: next_meeting(world, a, b, dt, at_end, width))(*sides) for sides in groups]
     if stops_of(world):
         meetings.append(meet_stops(world, flight, since, dt, at_end))
-    a, b = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
+    a, b = pair_ends(world)
     bounces = _coefficients(world, "restitution", a, b, dt.shape) > 0 if waits(world) else None
     a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
     links = Links(a, b, islands(ends_of(world.joints), len(world.names)))
@@ -185,7 +186,7 @@ def may_meet(world: "World", flight: Flight, dt: Array) -> Array:
     The test costs a fraction of the search for impacts, and lets a step without any skip everything else.
     """
     width = world.contact.width
-    margin = 0.0 if width is None else 40.0 * width  # beyond it a smooth impulse is below rounding, exp(-40)
+    margin = 0.0 if width is None else EXACT_BEYOND * width  # beyond it a smooth impulse is below rounding
 
     def one(a: Side, b: Side) -> Array:
         a, b = lax.stop_gradient((a, b))
@@ -211,6 +212,12 @@ def may_meet(world: "World", flight: Flight, dt: Array) -> Array:
         return jnp.asarray(True)
     near = [any_world(jax.vmap(one)(*sides_of(world, pairs, flight, since))) for pairs in world.pairs]
     return functools.reduce(jnp.logical_or, near)
+
+
+def pair_ends(world: "World") -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Colliders a, and colliders b, of every pair."""
+    a, b = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
+    return a, b
 
 
 def ends(world: "World") -> dict[str, tuple[int, ...]]:

@@ -13,7 +13,7 @@ from diffrigid.contact.approach import resting, task_of
 from diffrigid.contact.gaps import gaps_at
 from diffrigid.contact.impact import closed_form, round_rests
 from diffrigid.contact.sides import Side, earliest, have_faces, sides_of
-from diffrigid.contact.strikes import relative_path_is_straight
+from diffrigid.contact.strikes import pair_ends, relative_path_is_straight
 from diffrigid.contact.sums import side_sum
 from diffrigid.flight import Flight
 
@@ -36,8 +36,7 @@ def find_supported(world: "World", flight: Flight, since: Array, dt: Array) -> A
         rests: Callable = functools.partial(_rests, t1=dt, straight=straight, rest_speed=world.contact.rest_speed)
         found.append(jax.vmap(rests)(a, b))
     on = jnp.concatenate(found).astype(dt.dtype)
-    first, second = (tuple(i for pairs in world.pairs for i in getattr(pairs, side)) for side in "ab")
-    return side_sum(on, on, first, second, len(world.names)) > 0
+    return side_sum(on, on, *pair_ends(world), len(world.names)) > 0
 
 
 def _rests(a: Side, b: Side, t1: Array, straight: bool, rest_speed: Array) -> Array:
