@@ -8,7 +8,7 @@ from closed_form import numpy_motion
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
-from diffrigid.elimination import factorise, plan, substitute
+from diffrigid.elimination import factorise, plan_of, substitute
 
 STILL = 10**6  # a collider that does not move
 GRAPHS = {  # colliders a and b of every joint, and the number of bodies
@@ -32,7 +32,7 @@ def system(ends, moving, rows, rng, repeated=False):
     if repeated:
         jac[1:] = jac[:1]
     matrix = np.einsum("iecx...,jfcx...->iejf...", jac, jac)
-    pairs = [(i, i) for i in range(n)] + list(plan(ends, moving).pairs)
+    pairs = [(i, i) for i in range(n)] + list(plan_of(ends, moving).pairs)
     return matrix, jnp.stack([matrix[i, :, j] for i, j in pairs])
 
 
@@ -41,7 +41,7 @@ def test_elimination_is_the_dense_solution(name):
     ends, moving = tuple(GRAPHS[name][0]), GRAPHS[name][1]
     matrix, blocks = system(ends, moving, 2, rng := np.random.default_rng(0))
     right = rng.normal(size=(len(ends), 2, 3))
-    x = substitute(plan(ends, moving), factorise(plan(ends, moving), blocks), jnp.asarray(right))
+    x = substitute(plan_of(ends, moving), factorise(plan_of(ends, moving), blocks), jnp.asarray(right))
     size = 2 * len(ends)
     for k in range(3):
         dense = np.linalg.solve(matrix[..., k].reshape(size, size), right[..., k].ravel())
@@ -49,7 +49,7 @@ def test_elimination_is_the_dense_solution(name):
 
 
 def test_half_of_a_chain_goes_at_once():
-    levels = plan(tuple(GRAPHS["chain"][0]), 20).levels
+    levels = plan_of(tuple(GRAPHS["chain"][0]), 20).levels
     assert [len(level.pivots) for level in levels] == [10, 5, 3, 1, 1]
 
 
@@ -58,7 +58,7 @@ def test_repeated_equations_have_one_of_their_solutions():
     ends = ((0, 1),) * 3
     matrix, blocks = system(ends, 2, 5, np.random.default_rng(1), repeated=True)
     right = np.einsum("iejf...,jf...->ie...", matrix, np.random.default_rng(2).normal(size=(3, 5, 3)))
-    x = substitute(plan(ends, 2), factorise(plan(ends, 2), blocks), jnp.asarray(right))
+    x = substitute(plan_of(ends, 2), factorise(plan_of(ends, 2), blocks), jnp.asarray(right))
     assert_allclose(np.einsum("iejf...,jf...->ie...", matrix, x), right, atol=1e-9)
 
 
