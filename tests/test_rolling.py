@@ -66,6 +66,13 @@ def rolls(dim, mu, c, v, slope, t):
     return v * moves - 0.5 * braking * moves**2
 
 
+def rolls_back(dim, mu, c, v, slope, t):
+    """Up a slope until it stops, and down again against the same torque."""
+    stop = v * (1 + SHARE[dim]) / (G * (c / RADIUS * jnp.cos(slope) - jnp.sin(slope)))
+    back = G * (c / RADIUS * jnp.cos(slope) + jnp.sin(slope)) / (1 + SHARE[dim])
+    return 0.5 * v * stop + 0.5 * back * (t - stop) ** 2
+
+
 def slips_and_rolls(dim, mu, c, v, slope, t):
     """From no turning: r w grows by (mu - c / r) g cos(slope) / (I / m r^2) until it is v."""
     braking = G * (mu * jnp.cos(slope) - jnp.sin(slope))
@@ -77,6 +84,7 @@ def slips_and_rolls(dim, mu, c, v, slope, t):
 CASES = {
     "rolls on": (rolls, (0.5, 0.02, 1.0, 0.0, 1.0)),
     "stops within a step": (rolls, (0.5, 0.1, 1.0, 0.0, 0.97)),
+    "turns back on a slope": (rolls_back, (0.5, 0.02, 1.0, -0.25, 1.0)),
     "slips at first": (slips_and_rolls, (0.3, 0.02, 3.0, 0.0, 1.0)),
     "is held on a slope": (rolls, (0.5, 0.29 * RADIUS, 0.0, 0.28, 1.0)),
     "rolls down a slope": (rolls, (0.5, 0.27 * RADIUS, 0.0, 0.28, 1.0)),

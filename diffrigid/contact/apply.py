@@ -16,7 +16,7 @@ from diffrigid.contact.known import Known, beside, loads, reversing
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
 from diffrigid.contact.order import over_islands
 from diffrigid.contact.resting import Law, Strikes, barely, solve_impulses
-from diffrigid.contact.rolling import rolling_stops, with_rows
+from diffrigid.contact.rolling import beside_rolling, rolling_reversing, rolling_stops, with_rows
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
 from diffrigid.contact.sums import side_sum
@@ -72,7 +72,8 @@ def apply_impulses(
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     friction = None
     if known is not None:
-        friction = reversing(mobility, strikes, P, (dv, dw), law, held_for, world.contact.rest_speed)
+        found = rolling_reversing if is_rolling(world) else reversing
+        friction = found(mobility, strikes, P, (dv, dw), law, held_for, world.contact.rest_speed)
     # A force that has acted evenly has its centroid in the middle of its time, for which it displaces by P / m.
     displacing = jnp.where(kick > 0, 0.5 * held_for, 1.0)[:, None] * P + early_P
     moved = velocities(mobility, *momentum_changes(strikes, displacing, moving))[:2]
@@ -111,7 +112,9 @@ def _solved(
         acting = strikes.active.astype(kick.dtype)
         count = side_sum(acting, acting, strikes.a, strikes.b, flight.t0.shape[0])
         stopped = rolling_stops
-    if known is not None:
+    if known is not None and is_rolling(world):
+        strikes, law = beside_rolling(mobility, strikes, law, known, held_for)
+    elif known is not None:
         strikes, law = beside(mobility, strikes, law, known)
     rest_speed = world.contact.rest_speed
     guess = barely(strikes, rest_speed)

@@ -6,6 +6,7 @@ follow their contacts in the list, one each, before those of joints. In the plan
 Source: the documentation of MuJoCo, whose coefficients of spinning and rolling friction are these lengths.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +16,14 @@ from jax import Array
 
 from diffrigid.contact.cone import put, split, turning, without_turning
 from diffrigid.contact.impulse import sticking_impulse
+from diffrigid.contact.known import Known, beside, reversing
 from diffrigid.contact.mobility import Mobility, moved
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.slipping import STICKS, in_all, lost_to_stops, stopping_early
+from diffrigid.contact.slipping import STICKS, in_all, least_slip, lost_to_stops, stopping_early
 from diffrigid.contact.strikes import coefficients, contact_count
 from diffrigid.contact.sums import at_colliders
 from diffrigid.flight import Flight, angular_momentum
-from diffrigid.numerics import dot, norm, unit_vector
+from diffrigid.numerics import dot, norm, normalise, safe_divide, unit_vector
 from diffrigid.pytree import replace
 from diffrigid.state import rotations
 
@@ -99,20 +101,75 @@ def rolling_stops(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: A
     Where a contact sticks, the torque of its row comes with an impulse that keeps the contact from slipping. Both have
     the same centroid in time. Exact for one contact of two bodies.
     """
-    spin, mu, torque = strikes.spin, law.mu, turning(strikes.spin, P)
-    sticks = _sticks(strikes, P, mu)
+    spin, torque = strikes.spin, turning(strikes.spin, P)
+    sticks = _sticks(strikes, P, law.mu)
     pair = rows_of(strikes)
-    start = pair.v_rel - turning(spin, T)[:, None] * pair.pull
-    rest = P - _with_reaction(mobility, strikes, sticks, torque)
-    at_end = pair.v_rel + turning(spin, moved(rest, strikes, mobility))
-    load = jax.vmap(dot)(strikes.normal, P)[: len(spin)]
+    start, at_end = _turns(mobility, strikes, sticks, P, T)
     lost = jnp.zeros_like(torque)
-    parts = [(_about, spin * load), (_across, turning(spin, mu) * load)]
-    for part, bound in parts[: P.shape[1] - 1]:  # in the plane nothing is across
+    for part, bound in _parts(strikes, P, law.mu):
         slip, end, acting = (part(pair.normal, r) for r in (start, at_end, torque))
         of_all = in_all(pair, pair.active, bound)
         lost = lost + lost_to_stops(pair, turning(spin, T), slip, end, acting, bound, of_all, rest_speed)
     return _with_reaction(mobility, strikes, sticks, lost) + _of_slips(mobility, strikes, P, law, T, rest_speed)
+
+
+def rolling_reversing(
+    mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array, rest_speed: Array
+) -> Known:
+    """`reversing`, extended to rolling that stops and turns back within T, as that of a ball up a slope.
+
+    Spinning about the normal is left out: no force at a contact turns it back. Exact for one contact of two bodies.
+    """
+    free, others = _contacts_alone(mobility, strikes, P, T)
+    slips = reversing(mobility, free, others(P), changes, others(law), others(T), rest_speed)
+    sticks, pair, of_rows = _sticks(strikes, P, law.mu), rows_of(strikes), turning(strikes.spin, T)
+    part, bound = _parts(strikes, P, law.mu)[-1]
+    slip, at_end = (part(pair.normal, turn) for turn in _turns(mobility, strikes, sticks, P, T))
+    pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
+    against = -jax.vmap(dot)(slip, back)
+    stops = pair.active & pair.held & (of_rows > 0) & (against > least_slip(rest_speed)[None])
+    after = jnp.where(stops[:, None], -bound[:, None] * back, 0.0)
+    braked = moved(_with_reaction(mobility, strikes, sticks, after), strikes, mobility)
+    drag = -jax.vmap(dot)(turning(strikes.spin, braked), back)
+    turns = stops & (drag > 0) & (pull > drag) & (against < pull + drag)
+    after = jnp.where(turns[:, None], after, 0.0)
+    share = safe_divide(against, jnp.where(turns, pull + drag, 0.0))[:, None]
+    early = _with_reaction(mobility, strikes, sticks, -share * (1.0 - share) * of_rows[:, None] * after)
+    between = partial(_behind, len(after))
+    return Known(
+        P=between(slips.P, (1.0 - 2.0 * share) * after),
+        early=between(slips.early, jnp.zeros_like(after)) + early,
+        rubs=between(slips.rubs, turns.astype(T.dtype)),
+    )
+
+
+def beside_rolling(mobility: Mobility, strikes: Strikes, law: Law, known: Known, T: Array) -> tuple[Strikes, Law]:
+    """`beside`, where torques may be known: they pull evenly at what slips, and are not bounded by the load as well."""
+    spin, bound = strikes.spin, strikes.spin
+    by_torque = moved(put(spin, jnp.zeros_like(known.P), turning(spin, known.P)), strikes, mobility)
+    if known.P.shape[1] == 2:
+        bound = jnp.where(turning(spin, known.rubs) > 0, 0.0, spin)
+    strikes, law = beside(mobility, strikes, law, known)
+    pull = strikes.pull + safe_divide(by_torque, T[:, None])
+    return replace(strikes, pull=pull, spin=bound), law
+
+
+def _turns(mobility: Mobility, strikes: Strikes, sticks: Array, P: Array, T: Array) -> tuple[Array, Array]:
+    """Turning w_a - w_b (K, D, *batch) [rad/s] at the beginning, and after T without the torques of the rows."""
+    pair, torque = rows_of(strikes), turning(strikes.spin, P)
+    rest = P - _with_reaction(mobility, strikes, sticks, torque)
+    at_end = pair.v_rel + turning(strikes.spin, moved(rest, strikes, mobility))
+    return pair.v_rel - turning(strikes.spin, T)[:, None] * pair.pull, at_end
+
+
+def _parts(strikes: Strikes, P: Array, mu: Array) -> list[tuple[Callable, Array]]:
+    """Spinning, and in space rolling: the part of a vector that it is, and the bounds (K, *batch) [N m s] against it.
+
+    In the plane all turning is about what counts as the normal of a row.
+    """
+    load = jax.vmap(dot)(strikes.normal, P)[: len(strikes.spin)]
+    parts = [(_about, strikes.spin * load), (_across, turning(strikes.spin, mu) * load)]
+    return parts[: P.shape[1] - 1]
 
 
 def rows_of(strikes: Strikes) -> Strikes:
@@ -158,6 +215,14 @@ def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: 
 def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array, rest_speed: Array) -> Array:
     """`stopping_early` of contacts and rows of joints, with the torques of the rolling rows as an even pull."""
     spin, count = strikes.spin, len(strikes.spin)
+    free, others = _contacts_alone(mobility, strikes, P, T)
+    early = stopping_early(mobility, free, others(P), others(law), others(T), rest_speed)
+    return jnp.concatenate([early[:count], jnp.zeros_like(turning(spin, P)), early[count:]])
+
+
+def _contacts_alone(mobility: Mobility, strikes: Strikes, P: Array, T: Array) -> tuple[Strikes, Callable]:
+    """Contacts and rows of joints, with the torques of rolling rows as an even pull; a map of values to theirs."""
+    spin, count = strikes.spin, len(strikes.spin)
     by_torque = moved(put(spin, jnp.zeros_like(P), turning(spin, P)), strikes, mobility)
     pull = strikes.pull + by_torque / jnp.where(T > 0, T, 1.0)[:, None]
 
@@ -166,6 +231,4 @@ def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array
 
     free = others(replace(_arrays(strikes), v_rel=strikes.v_rel + by_torque, pull=pull))
     a, b, wholes = (of_all[:count] + of_all[2 * count :] for of_all in (strikes.a, strikes.b, strikes.wholes))
-    free = replace(free, a=a, b=b, wholes=wholes)
-    early = stopping_early(mobility, free, others(P), others(law), others(T), rest_speed)
-    return jnp.concatenate([early[:count], jnp.zeros_like(turning(spin, P)), early[count:]])
+    return replace(free, a=a, b=b, wholes=wholes, jac=strikes.jac, mid_jac=strikes.mid_jac), others
