@@ -177,8 +177,9 @@ def laws(world, states):
         energy = dr.kinetic_energy(world.bodies, state).sum() - (world.bodies.mass[:, None] * state.x * down).sum()
         spins = jnp.abs(dr.state.spin(world.bodies, state)).sum()
         arms = (jnp.linalg.norm(state.x, axis=1) * jnp.linalg.norm(p, axis=1)).sum()
-        floor_energy = (world.bodies.mass[:, None] * jnp.abs(state.x * down)).sum()
-        return energy, p.sum(0), L.sum(0), jnp.abs(p).sum(), arms + spins, floor_energy
+        lift = (world.bodies.mass[:, None] * jnp.abs(state.x * down)).sum()
+        creep = 0.5 * world.bodies.mass.sum() * world.contact.rest_speed**2  # of worlds where nothing moves
+        return energy, p.sum(0), L.sum(0), jnp.abs(p).sum(), arms + spins, lift + creep
 
     return jax.vmap(at)(states)
 
