@@ -76,7 +76,8 @@ def launch(world: "World", state: State, controls: Any, t0: Array, t1: Array) ->
 
 def _wrench(world: "World", state: State, controls: Any, span: Array) -> Wrench:
     """All forces on free bodies, and those of the joints, for an integration over span (*batch) [s]."""
-    wrench = total_wrench(world.forces, world.bodies, state, controls)
+    forces = tuple(force.within(span) if hasattr(force, "within") else force for force in world.forces)
+    wrench = total_wrench(forces, world.bodies, state, controls)
     return joint_wrench(world.joints, world.statics, world.bodies, state, wrench, span) if world.joints else wrench
 
 

@@ -7,7 +7,7 @@ attributes let the step skip work, and all default to the general case when abse
     uniform    every body has the same constant acceleration, so that relative paths are straight
     twists     the wrench has a torque
 
-A `planar` one is for 2D only.
+A `planar` one is for 2D only. One that depends on the length of the step has `within`, see `GroundFriction`.
 """
 
 from typing import Any, ClassVar
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.numerics import dot, norm, normalise, safe_divide, safe_sqrt
-from diffrigid.pytree import Leaf, array, pytree, static
+from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import Bodies, State, Wrench, material_point, material_velocity, rotations
 
 SPREAD = 0.94  # [-] mean distance from the centre over the radius of gyration: 0.943 of a disc, 0.937 of a square
@@ -76,8 +76,8 @@ class GroundFriction:
     """Dry friction of bodies that slide on level ground, seen from above: pucks, cars, billiard balls. In 2D.
 
     F = -P v and tau = -P arm^2 w with P = friction m g / sqrt(v^2 + arm^2 w^2 + slow^2), so that a spin makes a slide
-    longer, and both end together. Of several records on one body the forces add. What pushes a body with less than
-    `friction m g` makes it creep, by up to `slow`; where that is below friction g dt / 3, a body at rest trembles.
+    longer, and both end together, within the step by a displacement of the order of friction g dt^2. Of several records
+    on one body the forces add. What pushes a body with less than `friction m g` makes it creep, by up to `slow`.
     Source: Howe and Cutkosky, Int. J. Robotics Research 15 (1996) 557, the ellipsoid as limit surface.
 
     Args:
@@ -86,7 +86,7 @@ class GroundFriction:
         arm: (*batch) [m] mean distance of the pressure from the centre of mass; None: 0.94 radii of gyration, as of
             discs and squares whose weight is spread evenly, 2/3 of the radius of a disc.
         g: (*batch) [m/s^2] by which weight presses on the ground.
-        slow: (*batch) [m/s] speed below which friction falls to zero.
+        slow: (*batch) [m/s] speed below which friction falls to zero; at least friction g dt / 2.
 
     Example:
         >>> puck = dr.Body(dr.Disc(radius=0.1), mass=2.0, x=(0.0, 0.0), v=(1.0, 0.0))
@@ -100,7 +100,7 @@ class GroundFriction:
     friction: Leaf = array()
     arm: Leaf = array(default=None)
     g: Leaf = array(default=9.81)
-    slow: Leaf = array(default=0.01)
+    slow: Leaf = array(default=0.0)
     constant: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
     twists: ClassVar[bool] = True
@@ -115,6 +115,10 @@ class GroundFriction:
         v, w = state.v, state.w
         P = safe_divide(most, safe_sqrt((v**2).sum(1) + (arm * w[:, 0]) ** 2 + self.slow[None] ** 2))
         return Wrench(F=-P[:, None] * v, tau=-(P * arm**2)[:, None] * w)
+
+    def within(self, span: Array) -> "GroundFriction":
+        """The force for a step of length span (*batch) [s]: else it would throw bodies to and fro as they stop."""
+        return replace(self, slow=jnp.maximum(self.slow, 0.5 * self.friction * self.g * span))
 
 
 @pytree

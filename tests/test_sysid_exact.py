@@ -16,7 +16,9 @@ from scipy.special import stdtrit
 import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.sysid.covariance import own_covariance
+from diffrigid.sysid.levenberg import Numbers, point_at
 from diffrigid.sysid.profile import ProfileLikelihood
+from diffrigid.sysid.remarks import beside_a_jump, failed
 
 NOISE, RECORDS = 0.01, 6  # [m]
 FREE = {"gravity": dr.real(), "p.x": dr.each(dr.real()), "p.v": dr.each(dr.real())}
@@ -125,6 +127,14 @@ def test_a_parameter_that_is_derived_has_its_own_interval(fit, intervals):
     for end in ("value", "low", "high"):
         assert_allclose(getattr(gravity, end), getattr(fit["gravity"], end), rtol=1e-12)
         assert_allclose(getattr(position, end), getattr(fit["p.x"], end)[2], rtol=1e-12)
+
+
+def test_a_vector_of_another_length_is_refused(records):
+    problem = sysid.make_problem(*point(), records, free=FREE)
+    with pytest.raises(
+        ValueError, match=r"z has shape \(3,\): expected \(26,\), 2 shared numbers and 4 of each record"
+    ):
+        sysid.residual_vector(problem, np.zeros(3))
 
 
 def test_questions_to_a_fit_that_have_no_answer(fit, records):
@@ -481,6 +491,66 @@ def test_design_for_one_of_several_numbers():
     for few in ("starts", "steps"):
         with pytest.raises(ValueError, match=f"{few} is 0, expected an integer >= 1"):
             plan(**{few: 0})
+
+
+def test_a_jump_of_the_cost_beside_the_best_fit_is_noticed(fit, monkeypatch):
+    """Residuals leap by 5 deviations as soon as the numbers go where the slopes say that the cost falls."""
+    at = Numbers(jnp.asarray(fit.shared)[:, None], jnp.asarray(fit.own)[..., None])
+    best = point_at(fit.problem.groups, at)
+
+    def remarks(rows, leap):
+        def leaps(groups, z):
+            moved = point_at(groups, z)
+            return moved._replace(residuals=tuple(r + leap for r in moved.residuals))
+
+        monkeypatch.setattr("diffrigid.sysid.remarks.point_at", leaps)
+        linear = dr.replace(fit.linear, rows=tuple(row + rows for row in fit.linear.rows))
+        return beside_a_jump(fit.problem, best, 0, linear, fit.loss)
+
+    (jump,) = remarks(1e-2, 5.0)
+    assert jump.startswith("the cost jumps beside the best fit")
+    assert not remarks(1e-2, 0.0)  # it falls there, as the slopes say
+    assert not remarks(0.0, 5.0)  # at the bottom there is nothing to look for
+    rows = dr.replace(fit.summary, notes=(jump,)).rows()
+    assert {row["note"] for row in rows} == {"the cost jumps"}
+
+
+def test_a_failed_fit_names_the_records_whose_beginning_nothing_showed():
+    t, climb = np.arange(20) / 20, np.linspace(0.0, 5.0, 20)[:, None]
+    seen = {"t": t, "height": climb}
+    problem = sysid.make_problem(
+        *point(), [dr.Record(seen), dr.Record(seen, state=point()[1]), dr.Record(seen)],
+        free={"p.x": dr.each(dr.real())}, observe={"height": lambda state: 2.0 * state.x[0, 1:]},
+    )  # fmt: skip
+    assert "; record 0, 2 began at the state of the scene" in failed(problem, [{"height": climb}] * 3)
+    with pytest.raises(ValueError, match="put a row of NaN there, and start= says so"):
+        sysid.make_problem(*point(), {"t": [2.0], "p.x": [(0.0, 1.0)]}, free={"p.x": dr.real()})
+
+
+@pytest.mark.slow
+def test_which_side_of_a_tip_a_box_falls_to_makes_the_cost_jump():
+    """Measured as from the place where it would have begun, beyond the tip, if it had still gone to this side."""
+    tip = dr.Static(dr.Polygon(vertices=((-1.0, -1.0), (1.0, -1.0), (0.0, 0.0))))
+    box = dr.Body(dr.Box(half=(0.1, 0.1)), mass=1.0, x=(3e-3, 0.1 * np.sqrt(2) + 0.3), angle=np.pi / 4)
+    world, state = dr.scene({"box": box, "tip": tip}, gravity=(0.0, -9.81), restitution=0.5)
+
+    def path(x):
+        begun = dr.paths.write(world, state, "box.x[0]", x)
+        return dr.rollout(*begun, dt=1 / 60, steps=39)["box.x"]
+
+    seen = 2 * path(1e-6) - path(2e-3)
+    found = dr.fit(
+        world, state, {"t": np.arange(40) / 60, "box.x": seen}, free={"box.x[0]": dr.real()}, noise={"box.x": 1e-3},
+        progress=False,
+    )  # fmt: skip
+    assert 0 < found["box.x[0]"].value < 1e-4
+    assert any(note.startswith("the cost jumps beside the best fit") for note in found.notes)
+
+
+def test_values_that_fit_as_well_beyond_another_valley_are_in_the_note_of_a_profile():
+    rise = np.array([0.3, 2.0, 0.0, 2.0, 2.5])
+    found = ProfileLikelihood("k", np.arange(5.0), rise, 1.9, 1.2, 2.8)
+    assert found.apart == [0.0] and found.note == "profile, 0 fits as well"
 
 
 def test_figures_show_residuals_costs_correlations_and_profiles(fit):

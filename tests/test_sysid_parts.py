@@ -284,6 +284,6 @@ def test_times_in_milliseconds_are_doubted_before_the_fit():
     free = {"ball.v": dr.real()}
     for t, steps in ((np.linspace(0.0, 2000.0, 61), "1e.05"), (np.arange(61.0), "3e.03")):
         data = {"t": t, "ball.x": np.zeros((61, 2))}
-        with pytest.warns(UserWarning, match=f"takes {steps} steps of 0.02 s: are its times in ms"):
+        with pytest.warns(UserWarning, match=f"takes {steps} steps of 0.02 s: if its times are in ms"):
             sysid.make_problem(*dr.scene(bodies), data, free=free)
     sysid.make_problem(*dr.scene(bodies), data, free=free, dt=0.02)  # no warning: the steps are as they were asked for

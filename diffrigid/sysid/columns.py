@@ -120,7 +120,8 @@ def _table(observations: Any, where: str, left_out: Collection[str]) -> dict[str
 def _times(t: Any, where: str) -> np.ndarray:
     t = _floats(t, where)
     if t.ndim != 1 or len(t) < 2:
-        raise ValueError(f"{where} has shape {t.shape}: expected at least two increasing times")
+        alone = "" if t.shape != (1,) else ": if the motion began earlier, put a row of NaN there, and start= says so"
+        raise ValueError(f"{where} has shape {t.shape}: expected at least two increasing times{alone}")
     if len(bad := np.flatnonzero(~(np.diff(t) > 0))):
         k = int(bad[0])
         raise ValueError(

@@ -40,8 +40,10 @@ def _ends(slot: Slot) -> tuple[float, float]:
     return (slot.kind.low, slot.kind.high) if isinstance(slot.kind, Free) else (-1.0, 1.0)
 
 
-def is_shown(run: Run, slots: Sequence[Slot]) -> bool:
-    """Whether the first rows of a record show all that is free of its initial state."""
+def is_begun(run: Run, slots: Sequence[Slot]) -> bool:
+    """Whether a record has a state to begin with, or its first rows show all that is free of it."""
+    if run.stated:
+        return True
     seen, there = shown(run.world, run.series, run.channels, run.start), paths.catalogue(run.world)
     wholes = {paths.component(path)[0] for slot in slots for path in slot.paths}
     initial = [whole for whole in wholes if whole in there and there[whole][0].chain[0] == 1]

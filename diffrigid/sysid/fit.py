@@ -28,7 +28,7 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import pieces
 from diffrigid.sysid.points import by_column, linear_of, row_mask
-from diffrigid.sysid.remarks import failed, remarks_on, sticking
+from diffrigid.sysid.remarks import beside_a_jump, failed, remarks_on, sticking
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import LEAST, Problem, fitted_scenes, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Summary, versions
@@ -175,6 +175,8 @@ def finish(
     scenes = tuple(fitted_scenes(problem, shared, own))
     residuals = tuple(by_column(problem, point, best))
     stuck = sticking(problem, point, best, linear, uncertainty.covariance)
+    if jump := beside_a_jump(problem, point, best, linear, loss):
+        remarks = [*jump, *(remark for remark in remarks if remark == INTERRUPTED)]
     remarks = [*remarks, *remarks_on(problem, scenes, in_units), *stuck]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
     order, alike = np.argsort(costs), costs <= costs[best] + ALIKE[0] + ALIKE[1] * costs[best]

@@ -34,9 +34,18 @@ class ProfileLikelihood:
     open: tuple[str, ...] = ()  # "below", "above": where it does not
 
     @property
+    def apart(self) -> np.ndarray:
+        """Values beyond the interval whose rise is below the level too: the cost has another valley there."""
+        beyond = (self.values < self.low) | (self.values > self.high)
+        return self.values[beyond & (self.rise <= self.level)]
+
+    @property
     def note(self) -> str:
         """Note for a table."""
-        return f"profile, open {' and '.join(self.open)}" if self.open else "profile"
+        parts = [f"open {' and '.join(self.open)}"] if self.open else []
+        if len(self.apart):
+            parts.append(f"{', '.join(f'{value:.4g}' for value in self.apart[:3])} fits as well")
+        return ", ".join(["profile", *parts])
 
     def __repr__(self) -> str:
         interval = f"{self.name}: 95 % interval {self.low:.5g} to {self.high:.5g} ({self.note})"

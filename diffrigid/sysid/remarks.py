@@ -1,6 +1,7 @@
 """Remarks of a fit on its result as a whole, apart from the uncertainty of its numbers."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,8 @@ from diffrigid.shapes import Disc, Sphere
 from diffrigid.state import rotations
 from diffrigid.sysid.covariance import Linear
 from diffrigid.sysid.diagnosis import LARGE, RARE, whiteness
-from diffrigid.sysid.levenberg import Point, point_at
+from diffrigid.sysid.first_rows import is_begun
+from diffrigid.sysid.levenberg import Numbers, Point, cost_of, point_at
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Scene, pieces
 from diffrigid.sysid.points import linear_of
@@ -27,6 +29,9 @@ AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are a
 ANYWHERE = 0.25  # [-] of a turn: residuals of uniformly random angles are 1 / sqrt(12) of a turn
 OTHER = 1.1  # [-] change of the mass of a solid body beyond which an unchanged inertia is doubted
 ONE_SIDED = 0.1  # [-] of the information on a friction at the best fit: less a little above it is an end of slip
+WILD = 1e10  # [-] slopes in standard deviations: no motion that a step resolves has such
+FALLS = (1e-6, 1e-2)  # [-] of the cost, by its slopes: least that is worth a look there, and about the most of a look
+JUMPS = 2.0  # [-] a rise of the cost there: a jump
 TORN = 1e-3  # [m or rad] largest error of a joint at the fitted start without a remark
 
 
@@ -66,6 +71,39 @@ def sticking(problem: Problem, point: Point, best: int, linear: Linear, covarian
     return out
 
 
+def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, loss: Any) -> list[str]:
+    """Remarks on a best fit from which the cost should fall, by its slopes, but rises at once."""
+    a = linear.shared
+    g = np.stack([slopes.T @ rows for slopes, rows in zip(linear.slopes, linear.rows, strict=True)])  # (R, a + b)
+    h = np.stack([(slopes**2).sum(0) for slopes in linear.slopes])
+    if not np.isfinite(h).all() or np.sqrt(h.max(initial=0.0)) > WILD:
+        return [
+            "the slopes of the residuals are enormous: the motion is unstable, or chaotic; make dt smaller, or begin "
+            "with a short part, windows=(0.5, 1, inf)"
+        ]
+    shared = -_ratio(g[:, :a].sum(0), h[:, :a].sum(0))
+    own = -_ratio(g[:, a:], h[:, a:])
+    falls = -(g[:, :a].sum(0) @ shared + (g[:, a:] * own).sum())
+    if falls < FALLS[0]:
+        return []
+    z = jax.tree.map(lambda leaf: jnp.repeat(leaf[..., best : best + 1], leaf.shape[-1], -1), point.z)
+    share = min(1.0, FALLS[1] / falls)
+    step = Numbers(*(jnp.asarray(share * part, z.shared.dtype)[..., None] for part in (shared, own.T)))
+    beside = point_at(problem.groups, jax.tree.map(jnp.add, z, step))
+    here, there = (float(cost_of(loss, p.residuals)[k]) for p, k in ((point, best), (beside, 0)))
+    if there - here < JUMPS:
+        return []
+    return [
+        "the cost jumps beside the best fit, as where another corner strikes, or another body: intervals hold on one "
+        "side at most; see dr.profile, and more starts"
+    ]
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a / b, 0 where b is 0."""
+    return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
+
+
 def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], least: float = AS_LARGE) -> str:
     """Say which residuals are so large that this is no fit; "" if none are.
 
@@ -83,6 +121,11 @@ def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], least: 
         return ""
     size = "as large as" if least >= AS_LARGE else "not small beside"
     several = ", each() where records differ" if len(problem.runs) > 1 else ""
+    if unseen := [k for k, run in enumerate(problem.runs) if not is_begun(run, problem.own)]:
+        several += (
+            f"; record {', '.join(map(str, unseen[:3]))}{', ...' if unseen[3:] else ''} began at the state of the "
+            "scene, as the first rows do not show one: give a guess, dr.Record(..., state=first)"
+        )
     return (
         f"the fit failed: residuals of {', '.join(dict.fromkeys(names))} are {size} the motion; look at units (m, s, "
         "rad; degrees need scale=180 / pi), at signs, and at the values to begin with, or try more starts; the start "

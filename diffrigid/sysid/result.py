@@ -14,7 +14,7 @@ from diffrigid.convert import at_least_one
 from diffrigid.state import State
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, check_intervals
 from diffrigid.sysid.diagnosis import correlations
-from diffrigid.sysid.first_rows import is_shown
+from diffrigid.sysid.first_rows import is_begun
 from diffrigid.sysid.intervals import derived, describe
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.losses import Squares
@@ -185,9 +185,7 @@ class Fit:
             name: np.concatenate([columns[name].ravel() for columns in found if name in columns]) for name in names
         }
         sizes = {name: float(np.sqrt(np.nanmean(residuals**2))) for name, residuals in values.items()}
-        borrowed = [
-            k for k, run in enumerate(problem.runs) if not (fitted[k] or run.stated or is_shown(run, problem.own))
-        ]
+        borrowed = [k for k, run in enumerate(problem.runs) if not (fitted[k] or is_begun(run, problem.own))]
         self._warn_of_starts(sizes, borrowed)
         return sizes
 

@@ -110,7 +110,7 @@ def _doubt_times(found: Sequence[Run], longest: float, given: bool) -> None:
     if lasts > MANY * longest or (apart > SPARSE * longest and not given):
         warnings.warn(
             f"a record lasts {lasts:.3g} s, with rows {apart:.2g} s apart, which takes {lasts / longest:.2g} steps of "
-            f"{longest:.2g} s: are its times in ms, or numbers of frames? If they are seconds, give dt",
+            f"{longest:.2g} s: if its times are in ms, or numbers of frames, make them seconds; else give dt",
             stacklevel=4,
         )
 
@@ -262,13 +262,22 @@ def start_vector(problem: Problem) -> np.ndarray:
 
 def unpack(problem: Problem, z: np.ndarray) -> Numbers:
     """Unpack a vector (a + R b,) as one start."""
-    a, b = problem.sizes
+    (a, b), records = problem.sizes, len(problem.runs)
+    if np.shape(z) != (a + b * records,):
+        names = [slot.name for slot in (*problem.shared, *problem.own)]
+        raise ValueError(
+            f"z has shape {np.shape(z)}: expected ({a + b * records},), {a} shared numbers and {b} of each record, of "
+            f"{', '.join(names)}"
+        )
     own = np.asarray(z[a:]).reshape(len(problem.runs), b).T
     return Numbers(jnp.asarray(z[:a], problem.dtype)[:, None], jnp.asarray(own, problem.dtype)[:, :, None])
 
 
 def residual_vector(problem: Problem, z: np.ndarray) -> np.ndarray:
-    """Residuals in standard deviations, (m,); 0 where a value is missing."""
+    """Residuals in standard deviations, (m,); 0 where a value is missing. NumPy: `jacobian_matrix` is its derivative.
+
+    Where no noise was given, in those of a guess from the scatter of the column.
+    """
     numbers = unpack(problem, z)
     parts = [evaluate(g.plan, numbers.of(g.members), g.data)[..., 0].T.ravel() for g in problem.groups]
     return np.concatenate([np.asarray(part, float) for part in parts])

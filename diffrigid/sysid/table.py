@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
 BLIND = "not determined, see below"  # note of a parameter with a number that has no interval
 BOUND = "at its bound"  # note of a parameter that ended there
+DOUBTS = ("the fit failed", "not converged", "the cost jumps")  # beginnings of notes that concern every number
 SHOWN = 3  # records whose own numbers are in the table
 
 
@@ -50,10 +51,10 @@ def _number(p: Any, index: tuple[int, ...]) -> tuple[str, float, float, float, s
 def numbers(summary: "Summary") -> list[dict[str, Any]]:
     """Every number, those of all records too, unrounded: a dictionary of parameter, value, low, high, unit, note."""
     names = ("parameter", "value", "low", "high", "unit", "note")
+    doubts = [doubt for doubt in DOUBTS if any(note.startswith(doubt) for note in summary.notes)]
+    found = [_number(p, index) for p in summary.parameters for index in np.ndindex(p.value.shape)]
     return [
-        dict(zip(names, _number(p, index), strict=True))
-        for p in summary.parameters
-        for index in np.ndindex(p.value.shape)
+        dict(zip(names, (*number, "; ".join(filter(None, (note, *doubts)))), strict=True)) for *number, note in found
     ]
 
 
