@@ -4,11 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.contact import together
+from diffrigid.contact.apply import _no_further_than_flown
 from diffrigid.contact.cone import Cone, split
 from diffrigid.contact.mobility import Arms, Mobility, moved
+from diffrigid.flight import launch
 
 G, RATE = 9.81, 60
 STANDS = 1e-9  # [m] drift in two seconds; the solver works to rounding
@@ -164,3 +167,16 @@ def test_a_box_on_a_box_is_solved_at_any_speed():
     wrong = jnp.stack([-y_n, jnp.abs(P_n * y_n), -P_n, rubs - mu * P_n, slips * (mu * P_n - rubs), (P_t * y_t).sum(1)])
     assert (wrong.max((0, 1)) < 1e-6).mean() > 0.99
     assert wrong.max() < 1e-3  # [m/s], [N s], and their products
+
+
+def test_no_body_is_displaced_further_than_it_flies():
+    """Forces that began at different times all but cancel on a light body between heavy ones: 1 m is not its way."""
+    world, state = dr.scene({"light": dr.Body(dr.Disc(radius=0.1), mass=1e-3, x=(0.0, 1.0), v=(3.0, 0.0))})
+    dt = jnp.asarray(1 / 60)
+    flight = launch(world, state, None, jnp.zeros(1), dt)
+    shifts = jnp.array([[[0.0, 1.0]], [[0.02, 0.0]]])  # [m]; (3 + 5) m/s for a step are 0.13 m
+    for kick, expected in ((1.0, (8 * dt, 0.02)), (0.0, (1.0, 0.02))):
+        for shift, size in zip(shifts, expected, strict=True):
+            moved = shift, jnp.ones((1, 1))
+            there = _no_further_than_flown(flight, dt[None], jnp.array([[0.0, 4.0]]), moved, jnp.asarray(kick))
+            assert_allclose(there[0], size * shift / jnp.linalg.norm(shift))

@@ -77,6 +77,7 @@ def apply_impulses(
     # A force that has acted evenly has its centroid in the middle of its time, for which it displaces by P / m.
     displacing = jnp.where(kick > 0, 0.5 * held_for, 1.0)[:, None] * P + early_P
     moved = velocities(mobility, *momentum_changes(strikes, displacing, moving))[:2]
+    moved = _no_further_than_flown(flight, t, dv, moved, kick)
     pushed = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
     kept = _no_faster_than_drift(mobility, pushed, strikes) + keeping_spin(
         strikes, drift_after(strikes, dv), early_P, moving
@@ -87,6 +88,19 @@ def apply_impulses(
     # The new path of a body that was held, followed backwards, agrees with its true path to second order.
     since = jnp.where(count > 0, jnp.where(holds, flight.t0, t), anchors.since)
     return _anchored(flight, t, q, since, kicked, moved), friction, load
+
+
+def _no_further_than_flown(flight: Flight, t: Array, dv: Array, moved: tuple, kick: Array) -> tuple:
+    """Limit displacements and turns, (N, D, *batch) and (N, A, *batch), to the time times the speeds before and after.
+
+    They are half as large where all forces of a body have acted for one time. Where some have begun later, a light body
+    between heavy ones, on which these forces all but cancel, would be thrown off.
+    """
+    v = jax.vmap(velocity)(flight, t)
+    most = (t - flight.t0) * (jax.vmap(norm)(v) + jax.vmap(norm)(v + dv))
+    size = jax.vmap(norm)(moved[0])
+    share = jnp.where((kick > 0) & (size > most), safe_divide(most, size), 1.0)[:, None]
+    return share * moved[0], share * moved[1]
 
 
 def _no_faster_than_drift(mobility: Mobility, dL: Array, strikes: Strikes) -> Array:
