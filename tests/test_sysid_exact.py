@@ -511,6 +511,9 @@ def test_a_jump_of_the_cost_beside_the_best_fit_is_noticed(fit, monkeypatch):
     assert jump.startswith("the cost jumps beside the best fit")
     assert not remarks(1e-2, 0.0)  # it falls there, as the slopes say
     assert not remarks(0.0, 5.0)  # at the bottom there is nothing to look for
+    steep = dr.replace(fit.linear, slopes=tuple(1e12 * slopes for slopes in fit.linear.slopes))
+    (wild,) = beside_a_jump(fit.problem, best, 0, steep, fit.loss)
+    assert wild.startswith("the slopes of the residuals are enormous: the motion is unstable")
     rows = dr.replace(fit.summary, notes=(jump,)).rows()
     assert {row["note"] for row in rows} == {"the cost jumps"}
 

@@ -29,7 +29,7 @@ AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are a
 ANYWHERE = 0.25  # [-] of a turn: residuals of uniformly random angles are 1 / sqrt(12) of a turn
 OTHER = 1.1  # [-] change of the mass of a solid body beyond which an unchanged inertia is doubted
 ONE_SIDED = 0.1  # [-] of the information on a friction at the best fit: less a little above it is an end of slip
-WILD = 1e10  # [-] slopes in standard deviations: no motion that a step resolves has such
+WILD = 1e8  # [unit of a column] by one unit of a number: no motion that the steps resolve changes by so much
 FALLS = (1e-6, 1e-2)  # [-] of the cost, by its slopes: least that is worth a look there, and about the most of a look
 JUMPS = 2.0  # [-] a rise of the cost there: a jump
 TORN = 1e-3  # [m or rad] largest error of a joint at the fitted start without a remark
@@ -76,7 +76,8 @@ def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, los
     a = linear.shared
     g = np.stack([slopes.T @ rows for slopes, rows in zip(linear.slopes, linear.rows, strict=True)])  # (R, a + b)
     h = np.stack([(slopes**2).sum(0) for slopes in linear.slopes])
-    if not np.isfinite(h).all() or np.sqrt(h.max(initial=0.0)) > WILD:
+    noise = [*problem.noise.values(), *(np.min(sigma) for run in problem.runs for sigma in run.noise.values())]
+    if not np.isfinite(h).all() or np.sqrt(h.max(initial=0.0)) * min(noise) > WILD:
         return [
             "the slopes of the residuals are enormous: the motion is unstable, or chaotic; make dt smaller, or begin "
             "with a short part, windows=(0.5, 1, inf)"
