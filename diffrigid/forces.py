@@ -78,6 +78,7 @@ class GroundFriction:
     F = -P v and tau = -P arm^2 w with P = friction m g / sqrt(v^2 + arm^2 w^2 + slow^2), so that a spin makes a slide
     longer, and both end together, within the step by a displacement of the order of friction g dt^2. Of several records
     on one body the forces add. What pushes a body with less than `friction m g` makes it creep, by up to `slow`.
+    Differentiable everywhere, also at rest; a `scene` in 3D refuses it.
     Source: Howe and Cutkosky, Int. J. Robotics Research 15 (1996) 557, the ellipsoid as limit surface.
 
     Args:

@@ -8,7 +8,7 @@ from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.intervals import number_names
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import ProfileLikelihood
-from diffrigid.sysid.result import Fit, checked
+from diffrigid.sysid.result import Fit, checked_record
 
 
 def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:
@@ -23,7 +23,7 @@ def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:
 def residual_figure(fit: Fit, record: int = 0) -> Any:
     """Residuals of a record over time, in standard deviations."""
     figure, axes = _axes()
-    for series in fit.problem.runs[checked(fit, record)].series:
+    for series in fit.problem.runs[checked_record(fit, record)].series:
         values = fit.residuals[record][series.name][: len(series.t)]
         for k in range(values.shape[1]):
             label = series.name if values.shape[1] == 1 else f"{series.name}[{k}]"

@@ -60,7 +60,7 @@ def sticking(problem: Problem, point: Point, best: int, linear: Linear, covarian
         one = rows.start
         if not component(slot.paths[0])[0].endswith("friction") or not 0 < covariance[one, one] < LARGE**2:
             continue
-        z = jax.tree.map(lambda leaf: jnp.repeat(leaf[..., best : best + 1], leaf.shape[-1], -1), point.z)
+        z = _everywhere(point, best)
         above = z._replace(shared=z.shared.at[one].add(2.0 * np.sqrt(covariance[one, one])))
         slopes = linear_of(problem, point_at(problem.groups, above), best, Squares(), False).slopes
         if sum((jacobian[:, one] ** 2).sum() for jacobian in slopes) < ONE_SIDED * information[one]:
@@ -71,8 +71,13 @@ def sticking(problem: Problem, point: Point, best: int, linear: Linear, covarian
     return out
 
 
+def _everywhere(point: Point, best: int) -> Numbers:
+    """The numbers of the best start in the places of all."""
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf[..., best : best + 1], leaf.shape[-1], -1), point.z)
+
+
 def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, loss: Any) -> list[str]:
-    """Remarks on a best fit from which the cost should fall, by its slopes, but rises at once."""
+    """Remarks on a best fit whose slopes mislead: they are enormous, or the cost rises where by them it falls."""
     a = linear.shared
     g = np.stack([slopes.T @ rows for slopes, rows in zip(linear.slopes, linear.rows, strict=True)])  # (R, a + b)
     h = np.stack([(slopes**2).sum(0) for slopes in linear.slopes])
@@ -87,10 +92,9 @@ def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, los
     falls = -(g[:, :a].sum(0) @ shared + (g[:, a:] * own).sum())
     if falls < FALLS[0]:
         return []
-    z = jax.tree.map(lambda leaf: jnp.repeat(leaf[..., best : best + 1], leaf.shape[-1], -1), point.z)
     share = min(1.0, FALLS[1] / falls)
-    step = Numbers(*(jnp.asarray(share * part, z.shared.dtype)[..., None] for part in (shared, own.T)))
-    beside = point_at(problem.groups, jax.tree.map(jnp.add, z, step))
+    step = Numbers(*(jnp.asarray(share * part, problem.dtype)[..., None] for part in (shared, own.T)))
+    beside = point_at(problem.groups, jax.tree.map(jnp.add, _everywhere(point, best), step))
     here, there = (float(cost_of(loss, p.residuals)[k]) for p, k in ((point, best), (beside, 0)))
     if there - here < JUMPS:
         return []

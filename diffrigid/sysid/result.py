@@ -141,7 +141,7 @@ class Fit:
         Raises:
             ValueError: times begin before the record; there is no such record.
         """
-        scene, run = self.scenes[checked(self, record)], self.problem.runs[record]
+        scene, run = self.scenes[checked_record(self, record)], self.problem.runs[record]
         wanted = all_times(run) if times is None else np.asarray(times, float)
         if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME or not (np.diff(wanted) > 0).all():
             given = f"times has shape {wanted.shape}" + (f" and begins at {wanted.flat[0]:g} s" if wanted.size else "")
@@ -216,7 +216,9 @@ class Fit:
             >>> bool(lost.low < 1.0 - 0.8**2 < lost.high)  # share of the energy that an impact takes
             True
         """
-        return derived(self.problem, self.shared, self.own, self.linear, self.uncertainty, fn, checked(self, record))
+        return derived(
+            self.problem, self.shared, self.own, self.linear, self.uncertainty, fn, checked_record(self, record)
+        )
 
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
@@ -261,7 +263,7 @@ class Fit:
         return html_table(self.summary)
 
 
-def checked(fit: Fit, record: int) -> int:
+def checked_record(fit: Fit, record: int) -> int:
     """The number of a record of the fit; a ValueError if there is no such one."""
     if record not in range(len(fit.scenes)):
         raise ValueError(f"record is {record!r}: expected 0 to {len(fit.scenes) - 1}")
