@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from diffrigid.compiling import is_for_speed, uncollected
+from diffrigid.compiling import compiled, is_for_speed, uncollected
 from diffrigid.controls import as_controls, controlled
 from diffrigid.convert import at_least_one, numbers
 from diffrigid.devices import cut, devices, join, on_cpu, over_devices, pieces_of
@@ -181,5 +181,4 @@ def _run(world, state, controls, dt, steps, final_only, count, pieces, memory):
     return jax.tree.map(lambda leaf: join(leaf, 0, count), over_devices(chunks, split, (alike, dt)))
 
 
-STATIC = ("steps", "final_only", "count", "pieces", "memory")
-RUN = tuple(jax.jit(_run, static_argnames=STATIC, compiler_options=options) for options in OPTIONS)
+RUN = tuple(compiled(options, "steps", "final_only", "count", "pieces", "memory")(_run) for options in OPTIONS)

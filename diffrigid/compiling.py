@@ -3,37 +3,92 @@
 import functools
 import gc
 import os
-from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+
+class Options(Mapping[str, Any]):
+    """Compiler options, without those that the installed XLA does not have.
+
+    Options come and go between releases, even minor ones, and one that XLA does not have is an error. Which it has is
+    found by compiling something when the options are first read, not before: XLA then reads XLA_FLAGS.
+    """
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        self._options = options
+
+    @functools.cached_property
+    def _had(self) -> dict[str, Any]:
+        return {option: value for option, value in self._options.items() if _is_option(option, value)}
+
+    def __getitem__(self, option: str) -> Any:
+        return self._had[option]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._had)
+
+    def __len__(self) -> int:
+        return len(self._had)
+
+
+@functools.cache
+def _is_option(option: str, value: Any) -> bool:
+    try:
+        jax.jit(lambda: 0, compiler_options={option: value}).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
 # Without LLVM's optimisation one world runs slower, and a batch, of which nothing is vectorised then, much slower. Its
 # higher levels take longer to compile than the first and are no faster.
 PLAINER = {
-    "xla_cpu_use_fusion_emitters": False,  # with them a batch runs faster, but takes longer to compile
+    "xla_cpu_use_fusion_emitters": False,  # up to JAX 0.11.0; with them a batch runs faster, but compiling takes longer
     # They gain nothing here, and have all passes before them run again: half of the rounds of simplification are due to
     # a reshape that is moved by one operation in each.
     "xla_disable_hlo_passes": "reshape-mover,while-loop-constant-sinking,tree_reduction_rewriter",
 }
 LEVEL = "xla_backend_optimization_level"
-QUICK = PLAINER | {LEVEL: 0, "xla_cpu_parallel_codegen_split_count": 1}
+QUICK: Any = Options(  # `jax.jit` is annotated to take a dict
+    PLAINER | {LEVEL: 0, "xla_cpu_parallel_codegen_split_count": 1}
+)
 # For programs that run for longer than they compile; where XLA_FLAGS sets a level, as in the tests, that holds.
-LASTING = PLAINER | ({} if LEVEL in os.environ.get("XLA_FLAGS", "") else {LEVEL: 1})
+LASTING = Options(PLAINER | ({} if LEVEL in os.environ.get("XLA_FLAGS", "") else {LEVEL: 1}))
 # For large batches: vectors are as wide as there are, where LLVM by itself takes half of that.
-WIDE = {"xla_cpu_prefer_vector_width": 512}
+VECTORS = {"xla_cpu_prefer_vector_width": 512}
+WIDE = Options(VECTORS)
 # A loop whose step accesses fewer bytes is one function; short loops over the worlds are not written out one by one
 # before they are vectorised, as LLVM else does up to some hundred.
 SPEED = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000,-unroll-full-max-count=8",
-    *(f"--{option}={value}" for option, value in WIDE.items()),
+    *(f"--{option}={value}" for option, value in VECTORS.items()),
 )
 
 Inputs = ParamSpec("Inputs")
 Result = TypeVar("Result")
+
+
+def compiled(options: Any, *static: str) -> Callable[[Callable], Callable]:
+    """Decorator: `jax.jit` with compiler options and names of static arguments, made by `program()` at the first call.
+
+    `jax.jit` itself reads the options at once, and so starts XLA when the module is imported.
+    """
+
+    def decorate(fn: Callable) -> Callable:
+        @functools.wraps(fn)
+        def called(*args: Any, **kwargs: Any) -> Any:
+            return program()(*args, **kwargs)
+
+        program = functools.cache(lambda: jax.jit(fn, static_argnames=static, compiler_options=options))
+        called.program = program  # type: ignore[attr-defined]
+        return called
+
+    return decorate
 
 
 def uncollected(fn: Callable[Inputs, Result]) -> Callable[Inputs, Result]:

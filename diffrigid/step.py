@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.compiling import LASTING, QUICK, WIDE, is_for_speed, is_own_program, uncollected
+from diffrigid.compiling import LASTING, QUICK, WIDE, compiled, is_for_speed, is_own_program, uncollected
 from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, at_least_one, largest, numbers
@@ -205,10 +205,8 @@ def _rollout(world, state, intervals, controls, counts, memory):
 
 
 OPTIONS = QUICK, LASTING, WIDE, None
-STEP = tuple(jax.jit(_step, compiler_options=options) for options in OPTIONS)
-ROLLOUT = tuple(
-    jax.jit(_rollout, static_argnames=("counts", "memory"), compiler_options=options) for options in OPTIONS
-)
+STEP = tuple(compiled(options)(_step) for options in OPTIONS)
+ROLLOUT = tuple(compiled(options, "counts", "memory")(_rollout) for options in OPTIONS)
 
 
 def options_for(inputs: tuple, steps: int, worlds: int) -> int:

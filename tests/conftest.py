@@ -2,13 +2,14 @@
 
 import gc
 import os
+import subprocess
+import sys
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 --xla_backend_optimization_level=0 "
-    "--xla_disable_hlo_passes=reshape-mover,while-loop-constant-sinking,tree_reduction_rewriter",
-)
+if "XLA_FLAGS" not in os.environ:  # those of QUICK that XLA has: it is asked elsewhere, because it then reads them
+    flags = "from diffrigid import QUICK; print(*(f'--{k}={str(v).lower()}' for k, v in QUICK.items()))"
+    asked = subprocess.run([sys.executable, "-c", flags], check=True, capture_output=True, text=True)
+    os.environ["XLA_FLAGS"] = asked.stdout.strip()
 
 import jax
 import pytest

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
-from diffrigid.compiling import LASTING, QUICK, WIDE, is_own_program
+from diffrigid.compiling import LASTING, QUICK, WIDE, Options, is_own_program
 from diffrigid.step import OPTIONS, options_for
 
 SCRIPT = """
@@ -91,6 +91,22 @@ def test_quick_changes_the_time_to_compile_and_nothing_else():
     quick = jax.jit(slopes, compiler_options=dr.QUICK)(world, state)
     jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-15), quick, slopes(world, state))
     assert_allclose(quick[0].forces[0].g[..., 1].sum(), 0.1**2 / 2, rtol=1e-12)
+
+
+def test_options_that_xla_does_not_have_are_left_out():
+    """JAX 0.11.1, for one, dropped an option that 0.11.0 had, and refuses to compile with it."""
+    old = {"xla_that_was_dropped": False, "xla_backend_optimization_level": 0}
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_that_was_dropped"):
+        jax.jit(lambda x: 2 * x, compiler_options=old)(1.0)
+    assert dict(Options(old)) == {"xla_backend_optimization_level": 0} and len(Options(old)) == 1
+    assert jax.jit(lambda x: 2 * x, compiler_options=Options(old))(1.0) == 2.0
+    assert jax.jit(lambda x: x * Options(old)["xla_backend_optimization_level"])(1.0) == 0.0  # asked while tracing
+
+
+def test_importing_starts_no_xla():
+    """Else it had read XLA_FLAGS, and `jax.distributed.initialize` came too late."""
+    script = "import diffrigid, diffrigid.sysid, diffrigid.view.explore; from jax._src import xla_bridge; assert not xla_bridge._backends"
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def test_what_runs_for_long_is_compiled_for_longer():

@@ -128,13 +128,13 @@ def test_other_values_do_not_compile_again():
         return dr.scene({"ball": ball, "floor": floor}, gravity=gravity, restitution=e)
 
     quick = ROLLOUT[0], STEP[0]
-    before = [fn._cache_size() for fn in quick]
+    before = [fn.program()._cache_size() for fn in quick]
     for values, dt in (((1, 2, (0, -10), 0), 0.01), ((0.5, np.float32(2.5), (0.1, -9.81), 0.7), np.float64(0.02))):
         world, state = scene(*values)
         dr.rollout(world, state, dt=dt, steps=3)
         dr.rollout(dr.replace(world, contact=dr.Contact(width=dt)), state, dt=dt, steps=3)
         dr.step(world, state, dt)
-    assert [fn._cache_size() for fn in quick] == [count + 1 for count in before]
+    assert [fn.program()._cache_size() for fn in quick] == [count + 1 for count in before]
 
 
 def test_float32_stays_float32():

@@ -15,7 +15,7 @@ import optax
 from jax import Array
 
 from diffrigid.branches import choose
-from diffrigid.compiling import LASTING, uncollected
+from diffrigid.compiling import LASTING, compiled, uncollected
 from diffrigid.convert import at_least_one
 from diffrigid.sysid.levenberg import INTERRUPTED, UNFINISHED, Numbers, Point, point_at
 from diffrigid.sysid.problem import Group, Plan, residuals_of
@@ -89,7 +89,7 @@ def cost_and_slope(groups: Sequence[Group], z: Numbers, loss: Any) -> tuple[Arra
 
 
 @uncollected
-@partial(jax.jit, static_argnames=("plan", "loss"), compiler_options=LASTING)
+@compiled(LASTING, "plan", "loss")
 def _group_slope(plan: Plan, loss: Any, z: Array, data: Any) -> tuple[Array, Array]:
     def cost(z):
         by_start = loss.rho(residuals_of(plan, z, data)).sum((0, 1))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from diffrigid.compiling import QUICK, uncollected
+from diffrigid.compiling import QUICK, compiled, uncollected
 from diffrigid.paths import component, unit, write
 from diffrigid.state import State
 from diffrigid.sysid.covariance import LEAST_FREE, Linear, Uncertainty, joint_covariance, own_covariance
@@ -169,7 +169,7 @@ def derived(
     numbers = jnp.asarray(np.concatenate([shared, own[:, record]]), problem.dtype)
     covariance = joint_covariance(linear, record, uncertainty.covariance)
     unseen = unseen_of(blind_directions(linear, coordinates_of(problem)), slice(0, len(numbers)))
-    quick = uncollected(jax.jit(of_numbers, compiler_options=QUICK))
+    quick = uncollected(compiled(QUICK)(of_numbers))
     ends = _to_first_order(quick, numbers, covariance, uncertainty.quantile, unseen)
     return Parameter(getattr(fn, "__name__", type(fn).__name__), *ends, unit="", note="")
 

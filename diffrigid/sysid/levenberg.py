@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid.branches import choose
-from diffrigid.compiling import QUICK
+from diffrigid.compiling import QUICK, compiled
 from diffrigid.linear import einsum
 from diffrigid.sysid.problem import Group, linearise
 
@@ -154,7 +154,7 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
     return Arrow(A, B, D, eq.g * free[None], eq.h)
 
 
-@partial(jax.jit, static_argnames=("loss", "members"), compiler_options=QUICK)
+@compiled(QUICK, "loss", "members")
 def update(
     loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
 ) -> tuple[Progress, Numbers]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from diffrigid.compiling import LASTING, QUICK, uncollected
+from diffrigid.compiling import LASTING, QUICK, compiled, uncollected
 from diffrigid.devices import cut, devices, everywhere, join, on_cpu, over_devices, pieces_of
 from diffrigid.pytree import replace
 from diffrigid.scan import aligned, scan_steps
@@ -243,14 +243,12 @@ def residuals_of(plan: Plan, z: Array, data: Data) -> Array:
     return _simulated(plan, z.reshape(n, -1), _spread(data, 1, S))[0].reshape(-1, R, S)
 
 
-def _compiled(fn: Callable) -> tuple[Callable, ...]:
+def _versions(fn: Callable) -> tuple[Callable, ...]:
     """Two versions of `fn`: compiled as soon as possible, and compiled to run fast."""
-    return tuple(
-        uncollected(jax.jit(fn, static_argnames="plan", compiler_options=options)) for options in (QUICK, LASTING)
-    )
+    return tuple(uncollected(compiled(options, "plan")(fn)) for options in (QUICK, LASTING))
 
 
-LINEARISE, EVALUATE = map(_compiled, (linearised, residuals_of))
+LINEARISE, EVALUATE = map(_versions, (linearised, residuals_of))
 
 
 def linearise(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from diffrigid.compiling import LASTING, uncollected
+from diffrigid.compiling import LASTING, compiled, uncollected
 from diffrigid.convert import at_least_one
 from diffrigid.sysid.covariance import inverse
 from diffrigid.sysid.intervals import coordinates_of, unit_of
@@ -128,7 +128,7 @@ def _covariance(fit: Fit) -> np.ndarray:
 
 
 @uncollected
-@partial(jax.jit, static_argnames=("nuts", "parts", "shared", "own", "loss", "counts"), compiler_options=LASTING)
+@compiled(LASTING, "nuts", "parts", "shared", "own", "loss", "counts")
 def _chains(
     nuts: Any, parts: tuple[tuple[Plan, tuple[int, ...]], ...], shared: tuple[Slot, ...], own: tuple[Slot, ...],
     loss: Any, counts: tuple[int, int], keys: Array, first: Array, covariance: Array, data: tuple[Data, ...],

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid import paths
-from diffrigid.compiling import QUICK, uncollected
+from diffrigid.compiling import QUICK, compiled, uncollected
 from diffrigid.convert import at_least_one
 from diffrigid.state import State
 from diffrigid.step import floats, rollout, step_length
@@ -40,7 +40,7 @@ class Explorer:
             raise ValueError(f"ranges is {ranges!r}: expected a dict of parameters, {{'restitution': (0, 1)}}")
         self.ranges = {name: _range(name, span) for name, span in ranges.items()}
         run = partial(_with_slope, tuple(ranges), dt=dt, steps=at_least_one("steps", steps))
-        self._run = uncollected(jax.jit(run, compiler_options=QUICK))
+        self._run = uncollected(compiled(QUICK)(run))
         read = {name: paths.read(*self._start, name) for name in self.ranges}
         for name, value in read.items():
             if jnp.ndim(value):
