@@ -23,7 +23,7 @@ from diffrigid.scan import MEMORY, aligned, final_state, scan_steps
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State
 from diffrigid.step import OPTIONS, floats, options_for, step_length
-from diffrigid.world import World, axis_sizes, check_kinds, shape_of_leaf
+from diffrigid.world import World, axis_sizes, check_kinds, check_leaves
 
 LANES, LANES_GPU = 2**15, 2**23  # of a chunk: one for each contact, or more, and four for each body of its worlds
 # Lanes of a contact of shapes with corners, which needs a search and is rarely alone; least and most worlds of a chunk.
@@ -68,10 +68,11 @@ def rollout_batch(
         >>> last = jax.tree.map(lambda leaf: leaf[2], states)
         >>> page = dr.play(dr.Trajectory(t=jnp.arange(31) / 60, state=last, world=world))
     """
-    _check_leaves(world, state)
+    check_kinds(world, state)
+    batches = check_leaves(world, state, batch_first=True)
     world, state = floats(world, state)
     length, steps, memory = step_length(dt, state), at_least_one("steps", steps), at_least_one("memory", memory)
-    sizes = {size for tree in (world, state) for size in _batch_sizes(tree)}
+    sizes = {size for batch in batches for size in batch}
     if len(sizes) != 1:
         raise ValueError(
             f"rollout_batch: expected one leading batch axis on some leaf, got lengths {sorted(sizes)}"
@@ -100,29 +101,6 @@ def _batch_last(name: str, value: Any, own: tuple[int, int], count: int) -> Any:
     if array.shape not in (own, (count, *own)):
         raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {own} or {(count, *own)}.")
     return array if array.ndim == 2 else jnp.moveaxis(jnp.asarray(array), 0, -1)
-
-
-def _check_leaves(world: World, state: State) -> None:
-    """Raise ValueError unless given a world and a state, each leaf with at most one axis beside its own."""
-    check_kinds(world, state)
-    sizes = axis_sizes(world)
-
-    def compare(leaf, letters, path):
-        shape = shape_of_leaf(leaf, path)
-        own = shape[max(len(shape) - len(letters), 0) :]
-        wanted = [sizes.get(letter, size) for letter, size in zip(letters, own, strict=False)]
-        if len(own) < len(letters) or list(own) != wanted or len(shape) > len(letters) + 1:
-            raise ValueError(f"{path} has shape {shape}, expected ([B,] {', '.join(letters)}) in this world")
-        return leaf
-
-    map_arrays(compare, state, "state")
-    map_arrays(compare, world, "world")
-
-
-def _batch_sizes(tree) -> list[int]:
-    sizes: list[int] = []
-    map_arrays(lambda leaf, letters, _: sizes.extend(leaf.shape[: leaf.ndim - len(letters)]), tree)
-    return sizes
 
 
 def _chunk(world: World) -> int:

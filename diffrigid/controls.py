@@ -10,7 +10,7 @@ import jax
 from jax import lax
 
 from diffrigid.convert import nearest, numbers
-from diffrigid.forces import Drag, Force, Gravity, GroundFriction, SpringDamper, Torque
+from diffrigid.forces import FORCES, Force, Torque
 
 
 def controlled(forces: tuple, axis: int = 0) -> dict[str, int]:
@@ -45,7 +45,7 @@ def as_controls(
         if name not in given:
             raise ValueError(f"controls has no {name!r}: give controls={{{name!r}: ...}} of shape {(*steps, size)}.")
     if not isinstance(controls, Mapping) or any(name not in sizes for name in controls):
-        if all(isinstance(force, Gravity | Drag | GroundFriction | Force | Torque | SpringDamper) for force in forces):
+        if all(isinstance(force, FORCES) for force in forces):
             unused = sorted(set(given) - set(sizes)) or [repr(controls)]
             hint = nearest(unused[0], sizes) if sizes else "give Force or Torque a control."
             raise ValueError(f"controls: no force takes {', '.join(unused)}: {hint}")

@@ -90,8 +90,8 @@ def known_number(where: str, value: Any) -> Numbers:
 
 def at_least_one(where: str, count: Any) -> int:
     """Check and convert a count of steps, of worlds, or of bytes."""
-    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
-        raise ValueError(f"{where} is {count!r}, expected an integer >= 1")
+    if not isinstance(count, int | np.integer) or isinstance(count, bool) or not 1 <= count < 2**62:
+        raise ValueError(f"{where} is {count!r}, expected an integer >= 1 (and below 2^62)")
     return int(count)
 
 

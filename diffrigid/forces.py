@@ -75,7 +75,7 @@ class Drag:
 class GroundFriction:
     """Dry friction of bodies that slide on level ground, seen from above: pucks, cars, billiard balls. In 2D.
 
-    F = -P v and tau = -P arm^2 w with P = friction m g / sqrt(v^2 + arm^2 w^2 + slow^2), so that a spin makes a slide
+    F = -c v and tau = -c arm^2 w with c = friction m g / sqrt(v^2 + arm^2 w^2 + slow^2), so that a spin makes a slide
     longer, and both end together, within the step by a displacement of the order of friction g dt^2. Of several records
     on one body the forces add. What pushes a body with less than `friction m g` makes it creep, by up to `slow`.
     Differentiable everywhere, also at rest; a `scene` in 3D refuses it.
@@ -114,8 +114,8 @@ class GroundFriction:
         if self.body is not None:
             most = jnp.zeros_like(most).at[self.body].set(most[self.body])
         v, w = state.v, state.w
-        P = safe_divide(most, safe_sqrt((v**2).sum(1) + (arm * w[:, 0]) ** 2 + self.slow[None] ** 2))
-        return Wrench(F=-P[:, None] * v, tau=-(P * arm**2)[:, None] * w)
+        drag = safe_divide(most, safe_sqrt((v**2).sum(1) + (arm * w[:, 0]) ** 2 + self.slow[None] ** 2))
+        return Wrench(F=-drag[:, None] * v, tau=-(drag * arm**2)[:, None] * w)
 
     def within(self, span: Array) -> "GroundFriction":
         """The force for a step of length span (*batch) [s]: else it would throw bodies to and fro as they stop."""
@@ -251,3 +251,6 @@ def total_wrench(forces: tuple, bodies: Bodies, state: State, controls: Any) -> 
         if wrench.tau is not None and getattr(force, "twists", True):
             tau = wrench.tau if tau is None else tau + wrench.tau
     return Wrench(F=F, tau=tau)
+
+
+FORCES = Gravity, Drag, GroundFriction, Force, Torque, SpringDamper

@@ -8,8 +8,10 @@ from jax import Array
 
 from diffrigid.collide import COLLIDERS
 from diffrigid.convert import nearest
+from diffrigid.pytree import align_all
 from diffrigid.shapes import UNEVEN
 from diffrigid.state import State, rotations
+from diffrigid.step import floats
 from diffrigid.world import World, check
 
 
@@ -19,8 +21,8 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
     Negative where they overlap, then of the deepest contact. For `jit`, `vmap` and `grad`: what a controller sees.
 
     Raises:
-        ValueError: a name that is not there, a body without a shape, two statics, or a `Profile` or `HeightField`, of
-            which a body knows only the parts that it may touch within a step.
+        ValueError: a name that is not there, or twice the same, a body without a shape, two statics, or a `Profile` or
+            `HeightField`, of which a body knows only the parts that it may touch within a step.
 
     Differentiable, with a kink where the closest points jump.
 
@@ -29,6 +31,9 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
         0.9
     """
     check(world, state)
+    if a == b:
+        raise ValueError(f"gap: {a!r} twice: name two bodies, or a body and a static")
+    world, state = align_all(*floats(world, state))
     sides = [_placed(world, state, name) for name in (a, b)]
     for (shape, x, q), (other, x_other, q_other) in (sides, sides[::-1]):
         if find := COLLIDERS.get((type(shape), type(other))):

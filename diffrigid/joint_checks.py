@@ -141,8 +141,9 @@ def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:
         raise ValueError(f"{name}.restitution is that at its limits, and it has none: give lower or upper.")
     if {"lower", "upper"} & set(number):
         at: Any = known(lambda joint, a, b: joint.coordinate(so, a, b), joint, a, b)
-        if isinstance(joint, Revolute) and not traced(at) and np.cos(at) > 1 - TYPED**2:
-            at = np.zeros_like(at)  # an angle is known up to full turns; this one was meant as 0
+        if isinstance(joint, Revolute) and not traced(at):
+            rest = np.remainder(at + np.pi, 2 * np.pi) - np.pi
+            at = np.where(np.abs(rest) < TYPED, 0.0, at)  # an angle is known up to full turns; this one was meant as 0
         if not traced(at) and not lower - TYPED <= at <= upper + TYPED:
             raise ValueError(f"{name} starts at {float(at):g}, outside its limits {lower:g} to {upper:g}: move a body.")
 

@@ -86,7 +86,8 @@ def _directions(a: Outline, b: Outline) -> np.ndarray:
 def _across(a: Outline, b: Outline) -> np.ndarray:
     """Vectors from each edge of b to each corner of a, perpendicular to the edge."""
     to = a.corners[:, None] - b.starts[None]
-    share = (to * b.sides).sum(2) / (b.sides**2).sum(1)
+    square = (b.sides**2).sum(1)
+    share = (to * b.sides).sum(2) / np.where(square > 0, square, 1.0)
     return (to - share[:, :, None] * b.sides).reshape(-1, 3)
 
 

@@ -100,6 +100,12 @@ def align(node, rank: int):
     return map_arrays(expand, node)
 
 
+def align_all(*nodes) -> list:
+    """Give the arrays of several records the number of batch axes that the largest of them has."""
+    rank = max(map(batch_rank, nodes))
+    return [align(node, rank) for node in nodes]
+
+
 def refuse_missing(record, where: str) -> None:
     """Raise ValueError for a float leaf that is None, unless None is its default."""
     for field in dataclasses.fields(record):

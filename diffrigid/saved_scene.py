@@ -21,16 +21,16 @@ from jax import Array
 from diffrigid.collide import PairGroup
 from diffrigid.contact import Contact
 from diffrigid.convert import nearest
-from diffrigid.forces import Gravity
+from diffrigid.forces import FORCES
 from diffrigid.joints import JOINTS
-from diffrigid.scene_file import FORCES, read_scene
+from diffrigid.scene_file import read_scene
 from diffrigid.shapes import SHAPES, traced
 from diffrigid.state import Bodies, State
 from diffrigid.world import Offset, Statics, World, check
 
 FORMAT, VERSION = "diffrigid scene", 1
 DTYPES = "float16", "float32", "float64"
-RECORDS = World, State, Bodies, Statics, Offset, Contact, PairGroup, Gravity, *FORCES.values(), *SHAPES, *JOINTS
+RECORDS = World, State, Bodies, Statics, Offset, Contact, PairGroup, *FORCES, *SHAPES, *JOINTS
 
 
 def save_scene(path: str | Path, world: World, state: State) -> Path:

@@ -14,7 +14,7 @@ from diffrigid.devices import on_cpu
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import FOUND, PASSED, normalise, saving, with_tangents
-from diffrigid.pytree import align, batch_rank, replace
+from diffrigid.pytree import align_all, replace
 from diffrigid.state import State
 from diffrigid.world import World
 
@@ -48,8 +48,8 @@ def aligned(world: World, state: State) -> tuple[World, State]:
         inertia = world.bodies.inertia
         inertia = 0.5 * (inertia + jnp.swapaxes(inertia, 1, 2))
         world = replace(world, bodies=replace(world.bodies, inertia=inertia))
-    rank = max(batch_rank(world), batch_rank(state))
-    world, state = align(world, rank), align(state, rank)
+    world, state = align_all(world, state)
+    rank = state.x.ndim - 2
     batches = [leaf.shape[leaf.ndim - rank :] for leaf in jax.tree.leaves((world, state))]
     batch = np.broadcast_shapes(*batches)
 

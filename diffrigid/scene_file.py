@@ -50,6 +50,12 @@ from diffrigid.scene import Body, Static, scene
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
 
+
+def _words(kind: type) -> str:
+    """Name of a record in a file: half_space of HalfSpace."""
+    return re.sub("(?<=.)([A-Z])", r"_\1", kind.__name__).lower()
+
+
 TABLES = ("bodies", "statics", "forces", "joints", "free", "observe", "columns", "fit")
 ARGUMENTS = ("gravity", *COEFFICIENTS, "ignore", "contact")
 OPTIONS = ("starts", "dt", "noise", "widths", "windows", "iterations", "seed", "loss")
@@ -57,13 +63,12 @@ KINDS: dict[str, Callable] = {
     name: getattr(sysid, name)
     for name in ("interval", "positive", "real", "direction", "rotation", "inertia", "shares")
 }
-SHAPES = {re.sub("(?<=.)([A-Z])", r"_\1", kind.__name__).lower(): kind for kind in shapes.SHAPES}
-FORCES = {"spring": forces.SpringDamper, "ground_friction": forces.GroundFriction} | {
-    kind.__name__.lower(): kind for kind in (forces.Drag, forces.Force, forces.Torque)
-}
-JOINTS = {kind.__name__.lower(): kind for kind in joints.JOINTS}
+SHAPES = {_words(kind): kind for kind in shapes.SHAPES}
+FORCES = {_words(kind): kind for kind in forces.FORCES if kind is not forces.Gravity}
+FORCES["spring"] = FORCES.pop("spring_damper")
+JOINTS = {_words(kind): kind for kind in joints.JOINTS}
 OBSERVERS: dict[str, Callable] = {
-    kind.__name__.lower(): kind for kind in (sysid.Marker, sysid.Separation, sysid.Homography, sysid.Pinhole)
+    _words(kind): kind for kind in (sysid.Marker, sysid.Separation, sysid.Homography, sysid.Pinhole)
 }
 LOSSES: dict[str, Callable] = {"squares": sysid.squares, "huber": sysid.huber, "student": sysid.student}
 

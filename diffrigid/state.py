@@ -6,10 +6,11 @@ x is the centre of mass, in the world frame; v and w are in the world frame. Not
 from types import ModuleType
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from diffrigid import so2, so3
-from diffrigid.pytree import array, pytree, static
+from diffrigid.pytree import align, align_all, array, batch_rank, pytree, static
 
 COEFFICIENTS = (  # of colliders; all but the first two may be None
     "restitution",
@@ -80,6 +81,7 @@ def kinetic_energy(bodies: Bodies, state: State) -> Array:
         >>> round(float(energy[-1, 0]), 4)
         3.5348
     """
+    bodies, state = align_all(bodies, state)
     linear = bodies.mass * (state.v * state.v).sum(1)
     return 0.5 * (linear + (state.w * spin(bodies, state)).sum(1))
 
@@ -91,6 +93,7 @@ def momentum(bodies: Bodies, state: State) -> Array:
         >>> dr.momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()
         [[2.0, 0.0]]
     """
+    bodies, state = align_all(bodies, state)
     return bodies.mass[:, None] * state.v
 
 
@@ -101,6 +104,7 @@ def angular_momentum(bodies: Bodies, state: State) -> Array:
         >>> dr.angular_momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()  # no spin: an arm
         [[-2.0]]
     """
+    bodies, state = align_all(bodies, state)
     orbital = jax.vmap(rotations(bodies.dim).moment)(state.x, momentum(bodies, state))
     return orbital + spin(bodies, state)
 
@@ -117,8 +121,8 @@ def material_point(state: State, body: int, point: Array) -> Array:
         >>> dr.material_point(quarter, 0, jnp.array([0.1, 0.0])).tolist()
         [0.0, 1.1]
     """
-    so = rotations(state.x.shape[1])
-    return state.x[body] + so.rotate(state.q[body], point)
+    state, point = _aligned(state, point)
+    return state.x[body] + rotations(state.x.shape[1]).rotate(state.q[body], point)
 
 
 def material_velocity(state: State, body: int, point: Array) -> Array:
@@ -129,5 +133,12 @@ def material_velocity(state: State, body: int, point: Array) -> Array:
         >>> dr.material_velocity(spinning, 0, jnp.array([0.1, 0.0])).tolist()
         [0.0, 0.5]
     """
+    state, point = _aligned(state, point)
     so = rotations(state.x.shape[1])
     return state.v[body] + so.cross(state.w[body], so.rotate(state.q[body], point))
+
+
+def _aligned(state: State, point: Array) -> tuple[State, Array]:
+    """State and a point (D, *batch) with the same number of batch axes."""
+    rank = max(batch_rank(state), jnp.ndim(point) - 1)
+    return align(state, rank), jnp.reshape(point, jnp.shape(point) + (1,) * (rank + 1 - jnp.ndim(point)))

@@ -168,21 +168,27 @@ def _intervals(times: Any, dtype: Any) -> tuple[Any, Array]:
     t = numbers("times", times, None)
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
-    between = jnp.diff(t) if traced(t) else np.diff(np.asarray(times, float))
-    return t if traced(t) else np.asarray(times, float), jnp.asarray(between, dtype)
+    between = jnp.asarray(jnp.diff(t) if traced(t) else np.diff(np.asarray(times, float)), dtype)
+    gaps = _concrete(between)
+    if gaps is not None and not (gaps > 0).all():
+        raise ValueError(f"times must increase, got steps of {gaps.min():g} s or NaN: sort them and drop repeats")
+    return t if traced(t) else np.asarray(times, float), between
 
 
 def _substeps(intervals: Array, longest: Array) -> tuple[int, ...]:
-    """Number of steps of each interval, where these are concrete (as they are under `jax.grad`)."""
+    """Number of steps of each interval."""
+    gaps, most = _concrete(intervals), _concrete(longest)
+    if gaps is None or most is None:
+        raise ValueError("times or dt is traced by jit or vmap: give rollout the number of steps, substeps=(...)")
+    return tuple(steps_in(gaps, most).tolist())
+
+
+def _concrete(value: Array) -> np.ndarray | None:
+    """The numbers of an array, which it has under `jax.grad`; None: it is traced by jit or vmap."""
     try:
-        gaps, dt_known = np.asarray(lax.stop_gradient(intervals)), np.asarray(lax.stop_gradient(longest))
+        return np.asarray(lax.stop_gradient(value))
     except jax.errors.TracerArrayConversionError:
-        raise ValueError(
-            "times or dt is traced by jit or vmap: give rollout the number of steps, substeps=(...)"
-        ) from None
-    if not (gaps > 0).all():
-        raise ValueError(f"times must increase, got steps of {gaps.min():g} s or NaN: sort them and drop repeats")
-    return tuple(steps_in(gaps, dt_known).tolist())
+        return None
 
 
 def steps_in(gaps: np.ndarray, longest: Any) -> np.ndarray:

@@ -28,6 +28,8 @@ class Convex(NamedTuple):
         )  # fmt: skip
 
 
+OVER = 1e-8  # [-] of an edge: a corner that is no further beside a face is over it
+
 Pose = tuple[np.ndarray, np.ndarray]
 
 
@@ -100,7 +102,8 @@ def _on_faces(corners: np.ndarray, others: np.ndarray, faces: tuple):
     over = np.ones(height.shape, bool)
     for one, two in ((p, r), (r, s), (s, p)):
         inward = np.cross(normal, two - one)
-        over &= ((foot - one[:, None]) * inward[:, None]).sum(3) >= -1e-9
+        beside = -OVER * ((two - one) ** 2).sum(2)[:, None]
+        over &= ((foot - one[:, None]) * inward[:, None]).sum(3) >= beside
     # Inside, the face that is least deep; outside, the one it stands over.
     inside = (height < 0).all(2, keepdims=True)
     gap = np.where(over & (inside | (height >= 0)), np.abs(height), np.inf)

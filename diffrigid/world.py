@@ -86,12 +86,13 @@ def axis_sizes(world: World) -> dict[str, int]:
 
 
 def check_kinds(world: Any, state: Any) -> None:
-    """Raise ValueError unless the arguments are a world and a state, and the world has what its kind takes."""
+    """Raise ValueError unless the arguments are a world and a complete state, and the world has what its kind takes."""
     if not isinstance(world, World) or not isinstance(state, State):
         raise ValueError(
             f"expected (world, state), got ({type(world).__name__}, {type(state).__name__}): "
             "both come from `diffrigid.scene`, in this order."
         )
+    refuse_missing(state, "state")
     if world.crowd and not traced(world.contact.width) and np.any(np.asarray(world.contact.width) > 0):
         raise ValueError(f"contact.width is {world.contact.width}: expected 0 for so many bodies; use fewer.")
     if world.crowd and (world.forces or world.joints):
@@ -122,42 +123,53 @@ def check(world: World, state: State) -> None:
     if all(isinstance(leaf, Array) for leaf in leaves):
         _check_alike(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
     else:
-        _check_leaves(world, state)
+        _check_batches(check_leaves(world, state))
 
 
 @functools.lru_cache
 def _check_alike(tree: Any, leaves: tuple) -> None:
     """`check`, cached for arguments of the same structure, shapes and types."""
-    _check_leaves(*jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves]))
+    _check_batches(check_leaves(*jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])))
 
 
-def _check_leaves(world: World, state: State) -> None:
-    refuse_missing(state, "state")
-    sizes = axis_sizes(world)
-    batches: dict[tuple[int, ...], str] = {}
+def check_leaves(world: World, state: State, batch_first: bool = False) -> dict[tuple[int, ...], str]:
+    """Raise ValueError unless every leaf has its own axes, and is of floating point numbers.
+
+    Args:
+        batch_first: leaves have at most one batch axis, and that comes first; else any number, which come last.
+
+    Returns:
+        All batch axes, each with the path of a leaf that has them.
+    """
+    fixed, batches = axis_sizes(world), dict[tuple[int, ...], str]()
+    rows = [len(owners) for owners in world.owners], [len(group.a) for group in world.joints]
+    stacks = {"shapes": rows[0], "offsets": rows[0], "joints": rows[1]}
+    lengths = {f"world.{name}[{k}]": M for name, stack in stacks.items() for k, M in enumerate(stack)}
 
     def compare(leaf: Any, letters: tuple[str, ...], path: str):
-        shape = shape_of_leaf(leaf, path)
-        head = shape[: len(letters)]
-        known = [sizes.get(letter, size) for letter, size in zip(letters, head, strict=False)]
-        if len(head) < len(letters) or list(head) != known:
-            wanted = ", ".join(f"{l}={sizes[l]}" if l in sizes else l for l in letters)
+        shape, sizes = shape_of_leaf(leaf, path), fixed | {"M": lengths.get(path.rpartition(".")[0])}
+        count = max(len(shape) - len(letters), 0)
+        batch, own = (shape[:count], shape[count:]) if batch_first else (shape[len(letters) :], shape[: len(letters)])
+        known = [sizes.get(letter, size) for letter, size in zip(letters, own, strict=False)]
+        if len(own) < len(letters) or list(own) != known or (batch_first and count > 1):
+            wanted = [f"{l}={sizes[l]}" if l in sizes else l for l in letters]
+            axes, where = (["[B]", *wanted], "first") if batch_first else ([*wanted, "*batch"], "last")
             raise ValueError(
-                f"{path} has shape {shape}, expected ({wanted}, *batch) in this {world.dim}D world of "
-                f"{sizes['N']} bodies: make world and state with the same `scene`, and put batch axes last "
-                "(or use rollout_batch)."
+                f"{path} has shape {shape}, expected ({', '.join(axes)}) in this {world.dim}D world of "
+                f"{sizes['N']} bodies: make world and state with the same `scene`, and put batch axes {where}"
+                + ("." if batch_first else " (or use rollout_batch).")
             )
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             raise ValueError(
                 f"{path} has type {jnp.result_type(leaf)}, expected floating point: convert it with "
                 "jnp.asarray(..., float)."
             )
-        batches.setdefault(shape[len(letters) :], path)
+        batches.setdefault(batch, path)
         return leaf
 
     map_arrays(compare, state, "state")
     map_arrays(compare, world, "world")
-    _check_batches(batches)
+    return batches
 
 
 def _check_batches(batches: dict[tuple[int, ...], str]) -> None:

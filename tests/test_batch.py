@@ -126,6 +126,23 @@ def test_gradient_of_a_batch_is_that_of_each_world():
     assert_allclose(jax.jit(jax.grad(total))(v), np.stack([one(w) for w in v]), atol=1e-9)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_energy_momenta_and_points_of_a_batch_are_those_of_each_world(dim):
+    """As many worlds as bodies and dimensions: then arrays that are aligned wrongly broadcast all the same."""
+    shape, rng = dr.Box(half=(0.1, 0.2, 0.3)[:dim]), np.random.default_rng(0)
+    world, state = dr.scene({str(k): dr.Body(shape, mass=1.0 + k, x=np.full(dim, k)) for k in range(dim)})
+    states = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=(*leaf.shape, dim))), state)
+    points = jnp.asarray(rng.normal(size=(dim, dim)))
+    for k in range(dim):
+        alone = jax.tree.map(lambda leaf, k=k: leaf[..., k], states)
+        for fn in (dr.kinetic_energy, dr.momentum, dr.angular_momentum):
+            assert_allclose(fn(world.bodies, states)[..., k], fn(world.bodies, alone), rtol=ROUNDING)
+        for fn in (dr.material_point, dr.material_velocity):
+            assert_allclose(fn(states, 1, points)[..., k], fn(alone, 1, points[:, k]), rtol=ROUNDING)
+            assert_allclose(fn(states, 1, points[:, 0])[..., k], fn(alone, 1, points[:, 0]), rtol=ROUNDING)
+            assert_allclose(fn(alone, 1, points)[..., k], fn(alone, 1, points[:, k]), rtol=ROUNDING)
+
+
 def test_a_trajectory_of_many_worlds_is_read_by_path_in_each():
     """By `vmap` of `rollout`; states of `rollout_batch` have no times of their own, and are refused."""
     bodies = {name: dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(x, 1.0)) for name, x in (("a", 0.0), ("b", 3.0))}

@@ -173,6 +173,20 @@ def test_the_gap_of_two_bodies_is_their_distance_wherever_the_shape_sits(names):
     assert_allclose(moves[[world.names.index(name) for name in names if name in world.names]], 1.0, atol=1e-9)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_gaps_of_a_batch_are_those_of_each_world(dim):
+    """As many worlds as dimensions, so that arrays that are aligned wrongly broadcast all the same."""
+    bodies = {
+        "box": dr.Body(SHAPES[dim][dr.Box], mass=1.0, x=(0.1, 2.0, 0.3)[:dim]),
+        "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0, 0.0)[:dim]), x=(0.0, -1.0, 0.0)[:dim]),
+    }
+    world, state = dr.scene(bodies)
+    turns = jnp.linspace(0.1, 0.9, dim)[None] * jnp.ones((1 if dim == 2 else 3, dim))
+    states = dr.replace(state, q=rotations(dim).exp(turns)[None])
+    alone = [dr.gap(world, dr.replace(state, q=states.q[..., k]), "box", "floor") for k in range(dim)]
+    assert_allclose(dr.gap(world, states, "box", "floor"), alone, atol=ROUNDING)
+
+
 def test_a_gap_that_is_not_there_is_refused():
     world, state = dr.scene(
         {
@@ -188,6 +202,7 @@ def test_a_gap_that_is_not_there_is_refused():
         (("ball", "flor"), "did you mean 'floor'"),
         (("ball", "dot"), "no shape"),
         (("floor", "wall"), "neither"),
+        (("ball", "ball"), "twice"),
     ):
         with pytest.raises(ValueError, match=f"gap: .*{why}"):
             dr.gap(world, state, *names)

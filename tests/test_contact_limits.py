@@ -92,6 +92,20 @@ def test_nothing_tunnels():
     assert_allclose(energy[:, 1], 0.5 * speeds**2 + 0.5 * inertia * spins**2, rtol=EXACT)
 
 
+@pytest.mark.parametrize("width", [0.0, 1e-3])
+def test_a_rod_that_a_torque_spins_up_does_not_pass_a_peg(width):
+    """It stands still where the step begins: how fast its end comes follows from the torque alone."""
+    bodies = {
+        "rod": dr.Body(dr.Box(half=(0.5, 0.01)), mass=1.0, inertia=1.0, x=(0.0, 0.0)),
+        "peg": dr.Static(dr.Box(half=(0.02, 0.01)), x=(0.4, 0.15)),
+    }
+    torque, contact = [dr.Torque(body="rod", tau=200.0)], dr.Contact(width=width)
+    world, state = dr.scene(bodies, forces=torque, restitution=0.5, contact=contact)
+    once, often = (dr.rollout(world, state, dt=0.1 / n, steps=n).state.w[-1, 0, 0] for n in (1, 4))
+    assert_allclose(once, often, rtol=EXACT)
+    assert 17.0 < once < 18.0  # 20 without the peg
+
+
 @pytest.mark.parametrize("shape", [dr.Box(half=(0.01, 0.006)), dr.Capsule(radius=0.004, half_length=0.01)], ids=type)
 def test_what_is_small_and_fast_does_not_tunnel_in_single_precision(shape):
     """Thrown at a thin slab, one after the other: together in a batch each would search as long as the slowest."""

@@ -245,6 +245,15 @@ def test_limits_of_a_hinge_may_lie_beyond_half_a_turn(write):
     assert_allclose([read(world, state, f"j.{side}") for side in ("lower", "upper")], np.deg2rad([-20.0, 270.0]))
 
 
+def test_a_mesh_weighs_nothing_beside_an_inertial(tmp_path):
+    body = '<body name="a"><freejoint/><inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/><geom name="g" type="mesh" mesh="m"/></body>'
+    path = tmp_path / "model.xml"
+    path.write_text(mjcf(body))
+    with pytest.warns(UserWarning, match="a mesh"):
+        world, _ = dr.load_mjcf(path)
+    assert_allclose(world.bodies.mass, [2.0])
+
+
 REFUSED = {
     "no XML": ("<mujoco", "is not an XML file"),
     "another root": ("<robot/>", "starts with <robot>: expected <mujoco>"),

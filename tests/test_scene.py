@@ -233,3 +233,11 @@ def test_a_body_without_a_shape_flies(body):
     world, state = dr.scene({"free": free, "ground": ground}, gravity=-10.0 * np.eye(dim)[-1])
     after = dr.rollout(world, state, dt=0.1, steps=10).state
     assert_allclose(after.x[-1, 0], np.asarray(body.x) + 1.0 - 5.0 * np.eye(dim)[-1], rtol=1e-12)
+
+
+def test_plates_without_thickness_may_lie_side_by_side():
+    """Some of their edges have no length."""
+    plate = dr.Box(half=(0.5, 0.5, 0.0))
+    bodies = {str(k): dr.Body(plate, mass=1.0, x=(1.001 * k, 0.0, 0.0)) for k in range(2)}
+    world, state = dr.scene(bodies)
+    assert_allclose(dr.gap(world, state, "0", "1"), 0.001, atol=1e-12)

@@ -223,6 +223,11 @@ def test_a_batch_in_single_precision():
     assert_allclose(np.arctan2(s, c), expected, atol=2e-5)
 
 
+def test_an_angle_of_zero_is_no_full_turn_in_single_precision():
+    with jax.enable_x64(False), pytest.raises(ValueError, match="starts at 0, outside its limits 6 to 6.5"):
+        wheel(0.0, lower=6.0, upper=6.5)
+
+
 @pytest.mark.parametrize(
     "along, message",
     [

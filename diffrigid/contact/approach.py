@@ -19,6 +19,7 @@ from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.shapes import HeightField
 from diffrigid.state import rotations
 
+WANDER = 1.1  # [-] growth allowed to the angular speed of a free body in 3D within a step
 TOUCH_ROUNDING = 1e5  # [-] times eps times the near distance: gap that rounding may leave at touching bodies
 
 
@@ -182,28 +183,33 @@ def _least(times: Array) -> Array:
     return fold(jnp.minimum, times, 0) if len(times) <= MANY else times.min(0)
 
 
-def angular_speed(side: Side) -> Array:
-    """Angular speed where its path begins, (*batch) [rad/s]."""
+def spinning_up(side: Side, span: Array) -> tuple[Array, Array]:
+    """Bounds within a span [s] of its path: angular speed, and what torques add to it; (*batch) [rad/s], [rad/s^2]."""
     f = side.flight
     if f is None:
-        return jnp.zeros_like(side.x[0])
-    return norm(rotations(f.dim).unspin(f.inverse_inertia, f.q, f.L))
+        return jnp.zeros_like(span), jnp.zeros_like(span)
+
+    def speed(L: Array) -> Array:
+        return norm(rotations(f.dim).unspin(f.inverse_inertia, f.q, L))
+
+    alpha = jnp.zeros_like(span) if f.tau is None else speed(f.tau)
+    if f.twist is not None:
+        alpha = alpha + 0.5 * span * speed(f.twist)
+    return WANDER * speed(f.L) + span * alpha, alpha
 
 
 def _unsteady(side: Side, span: Array) -> tuple[Array, Array]:
     """Bounds within the step on what spin and acceleration add to a point's speed, and on its third derivative.
 
     (*batch) [m/s], [m/s^3]. Without a torque the angular acceleration of a rigid body does not exceed w^2, which bounds
-    the third derivative of an arm r by 6 w^3 r.
+    the third derivative of an arm r by 6 w^3 r. A torque that accelerates it by alpha adds 3 w alpha r, and as much as
+    alpha turns with the body.
     """
     f = side.flight
     if f is None:
         return jnp.zeros_like(span), jnp.zeros_like(span)
-    so, reach = rotations(f.dim), core_reach_of(side)
-    w, a = angular_speed(side), norm(f.a)
-    jerk = 8.0 * w * w * w * reach
+    reach, a, (w, alpha) = core_reach_of(side), norm(f.a), spinning_up(side, span)
+    jerk = (6.0 * w * w + 4.0 * alpha) * w * reach
     if f.jerk is not None:
         a, jerk = a + span * norm(f.jerk), jerk + norm(f.jerk)
-    if f.tau is not None:
-        jerk = jerk + 4.0 * w * reach * norm(so.unspin(f.inverse_inertia, f.q, f.tau))
-    return 1.1 * w * reach + a * span, jerk
+    return w * reach + a * span, jerk

@@ -18,7 +18,7 @@ from diffrigid.branches import any_world
 from diffrigid.contact.cone import put, split, turning, without_turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.slipping import in_all, least_slip, most_resisting, rubbing, slips
+from diffrigid.contact.slipping import in_all, least_slip, most_resisting, reversal, rubbing, slips
 from diffrigid.numerics import dot, norm, normalise, safe_divide
 from diffrigid.pytree import array, pytree, replace
 
@@ -65,9 +65,7 @@ def reversing(
 ) -> Known:
     """Friction where a slip stops and reverses within T, from trial impulses P with friction acting one way.
 
-    Until the stop, at a share of T, friction acts one way with its full bound, from then on the other way, evenly: the
-    sum is (1 - 2 share) of the second, and moves the contact less, by share (1 - share) T of it. Exact for one
-    direction of slip under a constant pull.
+    See `reversal`. How much the full bound brakes the slip follows from the trial impulses.
 
     Args:
         changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P.
@@ -77,7 +75,7 @@ def reversing(
     def found(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
         friction, bounds = rubbing(strikes, P, law)
         at_end, slip = slips(friction, strikes, law.target, T)
-        pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
+        back = jax.vmap(normalise)(at_end - slip)
         rubbed = friction(P)
         against, braked, own = (
             -jax.vmap(dot)(r, back) for r in (slip, friction(relative_changes(strikes, *changes)), rubbed)
@@ -93,11 +91,8 @@ def reversing(
         if law.most is not None:
             light = light | jnp.isfinite(law.most)
         drag = jnp.where(light, bound * per_impulse, 0.0)
-        turns = stops & (drag > 0) & (pull > drag) & (against < pull + drag)
-        share = safe_divide(against, jnp.where(turns, pull + drag, 0.0))[:, None]
-        after = jnp.where(turns[:, None], -bounds[:, None] * back, 0.0)
-        early = -share * (1.0 - share) * T[:, None] * after
-        return Known(P=(1.0 - 2.0 * share) * after, early=early, rubs=turns.astype(T.dtype))
+        P, early, turns = reversal(slip, at_end, bounds, drag, stops, T)
+        return Known(P=P, early=early, rubs=turns.astype(T.dtype))
 
     def nothing(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
         del changes, law

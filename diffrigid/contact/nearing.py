@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrigid.branches import choose
-from diffrigid.contact.approach import Task, angular_speed
+from diffrigid.contact.approach import Task, spinning_up
 from diffrigid.contact.gaps import Gaps, least_of
 from diffrigid.numerics import safe_divide, safe_sqrt, softplus
 
@@ -103,7 +103,7 @@ def nearer(task: Task, now: Nearing, gaps: Gaps) -> Nearing:
     kept = jnp.where(again, 0.5 * now.kept, 1.0)
     step = jnp.where(first, FIRST * task.span, 2.0 * now.step)
     for rate, most in (
-        (angular_speed(task.a) + angular_speed(task.b), TURN),
+        (spinning_up(task.a, task.span)[0] + spinning_up(task.b, task.span)[0], TURN),
         (-here.rate, _ahead(here.gap, task.width)),
     ):
         step = jnp.where(rate > 0, jnp.minimum(step, most / jnp.maximum(rate, task.slack)), step)

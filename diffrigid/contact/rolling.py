@@ -19,7 +19,7 @@ from diffrigid.contact.impulse import sticking_impulse
 from diffrigid.contact.known import Known, beside, reversing
 from diffrigid.contact.mobility import Mobility, moved
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.slipping import STICKS, in_all, least_slip, lost_to_stops, stopping_early
+from diffrigid.contact.slipping import STICKS, in_all, least_slip, lost_to_stops, reversal, stopping_early
 from diffrigid.contact.strikes import coefficients, contact_count
 from diffrigid.contact.sums import at_colliders
 from diffrigid.flight import Flight, angular_momentum
@@ -125,20 +125,16 @@ def rolling_reversing(
     sticks, pair, of_rows = _sticks(strikes, P, law.mu), rows_of(strikes), turning(strikes.spin, T)
     part, bound = _parts(strikes, P, law.mu)[-1]
     slip, at_end = (part(pair.normal, turn) for turn in _turns(mobility, strikes, sticks, P, T))
-    pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
-    against = -jax.vmap(dot)(slip, back)
-    stops = pair.active & pair.held & (of_rows > 0) & (against > least_slip(rest_speed)[None])
-    after = jnp.where(stops[:, None], -bound[:, None] * back, 0.0)
-    braked = moved(_with_reaction(mobility, strikes, sticks, after), strikes, mobility)
+    back = jax.vmap(normalise)(at_end - slip)
+    stops = pair.active & pair.held & (of_rows > 0) & (-jax.vmap(dot)(slip, back) > least_slip(rest_speed)[None])
+    full = jnp.where(stops[:, None], -bound[:, None] * back, 0.0)
+    braked = moved(_with_reaction(mobility, strikes, sticks, full), strikes, mobility)
     drag = -jax.vmap(dot)(turning(strikes.spin, braked), back)
-    turns = stops & (drag > 0) & (pull > drag) & (against < pull + drag)
-    after = jnp.where(turns[:, None], after, 0.0)
-    share = safe_divide(against, jnp.where(turns, pull + drag, 0.0))[:, None]
-    early = _with_reaction(mobility, strikes, sticks, -share * (1.0 - share) * of_rows[:, None] * after)
-    between = partial(_behind, len(after))
+    torque, early, turns = reversal(slip, at_end, bound, drag, stops, of_rows)
+    between = partial(_behind, len(torque))
     return Known(
-        P=between(slips.P, (1.0 - 2.0 * share) * after),
-        early=between(slips.early, jnp.zeros_like(after)) + early,
+        P=between(slips.P, torque),
+        early=between(slips.early, jnp.zeros_like(torque)) + _with_reaction(mobility, strikes, sticks, early),
         rubs=between(slips.rubs, turns.astype(T.dtype)),
     )
 

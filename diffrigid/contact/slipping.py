@@ -12,7 +12,7 @@ from diffrigid.contact.mobility import Mobility, momentum_changes
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sums import alike, at_colliders
 from diffrigid.gathers import constant, sum_rows
-from diffrigid.numerics import dot, norm, safe_divide
+from diffrigid.numerics import dot, norm, normalise, safe_divide
 from diffrigid.pytree import replace
 
 STICKS = 1.0 - 1e-6  # [-] of the bound of friction: below it a contact sticks
@@ -87,6 +87,33 @@ def least_slip(rest_speed: Array) -> Array:
     """Speed (*batch) [m/s] below which a contact does not slip, where `rest_speed` is slow."""
     least, rounding = CREEP
     return rest_speed * max(least, rounding * float(jnp.finfo(rest_speed.dtype).eps) ** 0.5)
+
+
+def reversal(
+    slip: Array, at_end: Array, bounds: Array, drag: Array, stops: Array, T: Array
+) -> tuple[Array, Array, Array]:
+    """Friction where a slip stops and turns back within T: impulses, what they move in addition, and where.
+
+    Until the stop, at a share of T, friction acts one way with its full bound, from then on the other way, evenly: the
+    sum is (1 - 2 share) of the second, and moves the contact less, by share (1 - share) T of it. Exact for one
+    direction of slip under a constant pull.
+
+    Args:
+        slip, at_end: (C, D, *batch) at the beginning, and at the end without friction.
+        bounds: (C, *batch) of friction.
+        drag: (C, *batch) change of the slip by the full bound.
+        stops: (C, *batch) bool: where the slip may stop.
+        T: (C, *batch) [s]
+
+    Returns:
+        (C, D, *batch) of friction; (C, D, *batch) of friction times [s]; (C, *batch) bool.
+    """
+    pull, back = jax.vmap(norm)(at_end - slip), jax.vmap(normalise)(at_end - slip)
+    against = -jax.vmap(dot)(slip, back)
+    turns = stops & (drag > 0) & (pull > drag) & (against < pull + drag)
+    share = safe_divide(against, jnp.where(turns, pull + drag, 0.0))[:, None]
+    after = jnp.where(turns[:, None], -bounds[:, None] * back, 0.0)
+    return (1.0 - 2.0 * share) * after, -share * (1.0 - share) * T[:, None] * after, turns
 
 
 def in_all(strikes: Any, slipping: Array, values: Array) -> Array:

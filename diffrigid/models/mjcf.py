@@ -217,8 +217,8 @@ def _not_zero(reader: Reader, name: str, values: np.ndarray) -> np.ndarray:
 def _mass(model: Model, element: ElementTree.Element, name: str, masses: list[Mass]) -> Mass | None:
     """Mass by <inertial>, or summed over the geoms."""
     inertial = element.find("inertial")
-    if inertial is None or model.from_geoms == "true":
-        return total(masses) if masses and model.from_geoms != "false" else None
+    if inertial is None or _weighs_geoms(model, element):
+        return total(masses) if masses else None
     reader = Reader(model.where, f"inertial of {name}", dict(inertial.attrib))
     R = _rotation(model, reader)
     if reader.given("fullinertia"):
@@ -229,9 +229,15 @@ def _mass(model: Model, element: ElementTree.Element, name: str, masses: list[Ma
     return Mass(reader.number("mass"), reader.numbers("pos", 3), inertia)
 
 
+def _weighs_geoms(model: Model, element: ElementTree.Element) -> bool:
+    """Whether the mass of a body is that of its geoms: the world has none."""
+    by_geoms = {"true": True, "false": False, "auto": element.find("inertial") is None}
+    return element.tag == "body" and by_geoms[model.from_geoms]
+
+
 def _geoms(model: Model, element: ElementTree.Element, body: str, scope: str) -> tuple[list[Geometry], list[Mass]]:
     """Shapes and masses of the geoms of a body."""
-    shapes, masses = [], []
+    shapes, masses, weighed = [], [], _weighs_geoms(model, element)
     for index, geom in enumerate(element.findall("geom")):
         reader = model.reader(geom, scope)
         name = model.name_of(geom, f"{body}_geom{index}")
@@ -241,7 +247,7 @@ def _geoms(model: Model, element: ElementTree.Element, body: str, scope: str) ->
         shapes.append(Geometry(name, made.shape, made.frame, float(rub), bits))
         if made.shape is None and any(bits):
             model.left_out.append(f"contacts of {reader.label or name}, a {made.kind}")
-        if body != "world" and (mass := mass_of(reader, made)) is not None:
+        if weighed and (mass := mass_of(reader, made)) is not None:
             masses.append(mass)
         model.left_out += reader.left_out(*LOOKS, "density", "mass")
     return shapes, masses

@@ -10,7 +10,6 @@ import jax
 import numpy as np
 
 from diffrigid import state as of_state
-from diffrigid.pytree import align
 from diffrigid.touch import rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.view.frames import energies
@@ -75,7 +74,7 @@ def momentum(trajectory: Trajectory, angular: bool = False, ax: Any = None) -> A
     world, ax, t = checked(trajectory).world, _axes(ax), np.asarray(trajectory.t)
     last = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), 0, -1), trajectory.state)
     of = of_state.angular_momentum if angular else of_state.momentum
-    total = np.asarray(of(align(world.bodies, 1), last)).sum(0)
+    total = np.asarray(of(world.bodies, last)).sum(0)
     for column, name in zip(total, "xyz" if len(total) > 1 else "z", strict=False):
         ax.plot(t, column, label=name)
     return _labelled(ax, "time [s]", "angular momentum [N m s]" if angular else "momentum [N s]")

@@ -14,7 +14,6 @@ import numpy as np
 from diffrigid import impacts
 from diffrigid.forces import Gravity, SpringDamper
 from diffrigid.joints import Distance
-from diffrigid.pytree import align
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Profile, Shape, Sphere, with_topology
 from diffrigid.state import State, kinetic_energy
 from diffrigid.sysid.columns import columns
@@ -162,7 +161,7 @@ def links(world: World) -> list[dict[str, Any]]:
 def energies(world: World, state: State) -> np.ndarray:
     """Columns [J]: kinetic, potential (gravity, and springs), their sum; of states with a leading time axis."""
     last = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), 0, -1), state)
-    kinetic = np.asarray(kinetic_energy(align(world.bodies, 1), last), float).sum(0)
+    kinetic = np.asarray(kinetic_energy(world.bodies, last), float).sum(0)
     x, mass = np.asarray(state.x, float), np.asarray(world.bodies.mass, float)
     potential = np.zeros(len(x))
     for force in world.forces:
