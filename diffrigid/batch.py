@@ -21,9 +21,9 @@ from diffrigid.devices import cut, devices, join, on_cpu, over_devices, pieces_o
 from diffrigid.pytree import map_arrays
 from diffrigid.scan import MEMORY, aligned, final_state, scan_steps
 from diffrigid.shapes import Disc, HalfSpace, Sphere
-from diffrigid.state import State
+from diffrigid.state import State, rotations
 from diffrigid.step import OPTIONS, floats, options_for, step_length
-from diffrigid.world import World, axis_sizes, check_kinds, check_leaves
+from diffrigid.world import World, check_kinds, check_leaves
 
 LANES, LANES_GPU = 2**15, 2**23  # of a chunk: one for each contact, or more, and four for each body of its worlds
 # Lanes of a contact of shapes with corners, which needs a search and is rarely alone; least and most worlds of a chunk.
@@ -123,8 +123,8 @@ def _chunk(world: World) -> int:
 
 
 def _state_bytes(world: World, state: State) -> int:
-    sizes = axis_sizes(world)
-    return sizes["N"] * (2 * sizes["D"] + sizes["Q"] + sizes["A"]) * state.x.dtype.itemsize
+    so = rotations(world.dim)
+    return len(world.names) * (2 * so.D + so.Q + so.A) * state.x.dtype.itemsize
 
 
 def _batch_axes(world: World, controls: Any, count: int) -> list[int | None]:

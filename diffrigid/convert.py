@@ -18,6 +18,7 @@ from diffrigid import so2
 from diffrigid.moments import volume_properties
 from diffrigid.pytree import map_arrays, refuse_missing, replace, undeclared_fields
 from diffrigid.shapes import HalfSpace, dimension, traced, with_topology
+from diffrigid.state import axis_sizes, rotations
 
 TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: typed numbers have a few digits
 FLAT = 1e-9  # [-] of the largest principal inertia: a body with a smaller one has no thickness
@@ -152,8 +153,8 @@ def orientation(name: str, body: Any, dim: int) -> Numbers:
         if dim == 3:
             raise ValueError(f"{name}.angle: expected q = (w, x, y, z), a unit quaternion, in a 3D scene.")
         return known(so2.exp, numbers(f"{name}.angle", body.angle, ())[None])
-    unturned = (1.0, 0.0) if dim == 2 else (1.0, 0.0, 0.0, 0.0)
-    q = numbers(f"{name}.q", unturned if body.q is None else body.q, (len(unturned),))
+    unturned = np.eye(rotations(dim).Q)[0]
+    q = numbers(f"{name}.q", unturned if body.q is None else body.q, unturned.shape)
     return unit_quaternion(f"{name}.q", q)
 
 
@@ -171,7 +172,7 @@ def _length(vector: Numbers) -> Numbers:
 
 def angular_velocity(name: str, w: Any, dim: int) -> Numbers:
     """Check and convert w, (1,) or (3,); in 2D it may be a number."""
-    size = 1 if dim == 2 else 3
+    size = rotations(dim).A
     array = numbers(f"{name}.w", np.zeros(size) if w is None else w, None)
     return numbers(f"{name}.w", array[None] if dim == 2 and array.ndim == 0 else array, (size,))
 
@@ -300,7 +301,7 @@ def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
             )
         if target is not None:
             changes[field] = bodies.index(target)
-    sizes = {"N": len(bodies), "D": dim, "A": 1 if dim == 2 else 3, "Q": 2 if dim == 2 else 4}
+    sizes = {"N": len(bodies)} | axis_sizes(dim)
 
     def fill(leaf, letters, path):
         axes = tuple(sizes.get(letter) for letter in letters)

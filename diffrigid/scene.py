@@ -31,7 +31,7 @@ from diffrigid.pytree import map_arrays, refuse_missing
 from diffrigid.shape_checks import check_shape
 from diffrigid.shape_records import contact_count, looking_around, stack_shapes
 from diffrigid.shapes import BOUNDLESS, Shape, dimension, traced
-from diffrigid.state import COEFFICIENTS, Bodies, State
+from diffrigid.state import COEFFICIENTS, Bodies, State, rotations
 from diffrigid.world import Statics, World
 
 TURNING = {"rolling_friction", "spinning_friction"}
@@ -244,7 +244,7 @@ def _poses(bodies: Mapping[str, Body | Static], dim: int) -> dict[str, Any]:
     """Positions and orientations, stacked."""
     x = [numbers(f"{k}.x", np.zeros(dim) if b.x is None else b.x, (dim,)) for k, b in bodies.items()]
     q = [orientation(k, b, dim) for k, b in bodies.items()]
-    return {"x": stack(x, (dim,)), "q": stack(q, (2 if dim == 2 else 4,))}
+    return {"x": stack(x, (dim,)), "q": stack(q, (rotations(dim).Q,))}
 
 
 def _state(moving: Mapping[str, Body], dim: int) -> State:

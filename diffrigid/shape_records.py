@@ -13,6 +13,7 @@ from diffrigid.collide.heights import cells_for
 from diffrigid.convert import Solid, known, stack
 from diffrigid.pytree import replace
 from diffrigid.shapes import HeightField, Hull, Polygon, traced
+from diffrigid.state import rotations
 from diffrigid.world import Offset
 
 
@@ -59,7 +60,7 @@ def stack_shapes(shapes: Mapping[str, Any], solids: Mapping[str, Solid | None], 
 
 def contact_count(records: Sequence, dim: int, i: int, j: int) -> int:
     """Number of contacts that the pair function of two of the records returns."""
-    x, q = np.zeros(dim, jnp.result_type(float)), np.zeros(2 if dim == 2 else 4, jnp.result_type(float))
+    x, q = np.zeros(dim, jnp.result_type(float)), np.zeros(rotations(dim).Q, jnp.result_type(float))
     a, b = (jax.tree.map(lambda leaf: leaf[0], records[k]) for k in (i, j))
     contacts = jax.eval_shape(COLLIDERS[type(a), type(b)], a, x, q, b, x, q)
     return contacts.gap.shape[0]

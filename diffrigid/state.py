@@ -26,6 +26,12 @@ def rotations(dim: int) -> ModuleType:
     return so2 if dim == 2 else so3
 
 
+def axis_sizes(dim: int) -> dict[str, int]:
+    """Sizes of the axes named D, A and Q: components of a vector, an angular velocity, an orientation."""
+    so = rotations(dim)
+    return {"D": so.D, "A": so.A, "Q": so.Q}
+
+
 @pytree
 class State:
     """State of N bodies in D dimensions: all that a step changes. A = 1 or 3, Q = 2 or 4 (see so2, so3).

@@ -12,7 +12,7 @@ from diffrigid.collide import PairGroup
 from diffrigid.contact import Contact
 from diffrigid.pytree import array, map_arrays, pytree, refuse_missing, stacked, static
 from diffrigid.shapes import traced
-from diffrigid.state import Bodies, State
+from diffrigid.state import Bodies, State, axis_sizes
 
 
 @pytree
@@ -78,13 +78,6 @@ class Offset:
     r: Array = array("M", "D")  # (M, D, *batch) [m] from the centre of mass, body axes
 
 
-def axis_sizes(world: World) -> dict[str, int]:
-    """Sizes of the axes that the letters stand for, in this world."""
-    dim = world.dim
-    sizes = {"N": len(world.names), "S": len(world.static_names)}
-    return sizes | {"D": dim, "A": 1 if dim == 2 else 3, "Q": 2 if dim == 2 else 4}
-
-
 def check_kinds(world: Any, state: Any) -> None:
     """Raise ValueError unless the arguments are a world and a complete state, and the world has what its kind takes."""
     if not isinstance(world, World) or not isinstance(state, State):
@@ -141,7 +134,8 @@ def check_leaves(world: World, state: State, batch_first: bool = False) -> dict[
     Returns:
         All batch axes, each with the path of a leaf that has them.
     """
-    fixed, batches = axis_sizes(world), dict[tuple[int, ...], str]()
+    batches: dict[tuple[int, ...], str] = {}
+    fixed = {"N": len(world.names), "S": len(world.static_names)} | axis_sizes(world.dim)
     rows = [len(owners) for owners in world.owners], [len(group.a) for group in world.joints]
     stacks = {"shapes": rows[0], "offsets": rows[0], "joints": rows[1]}
     lengths = {f"world.{name}[{k}]": M for name, stack in stacks.items() for k, M in enumerate(stack)}

@@ -6,6 +6,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid.pytree import array, pytree
+from diffrigid.state import rotations
 
 ALERT = 4e-3  # [-] of the size: least gap of a feature that may be met within the step; above `NEAR` of the search
 FAR = 1e6  # [m] gap of features that cannot meet, and reach of unbounded shapes
@@ -24,6 +25,13 @@ class Contacts:
 def joined(*parts: Contacts) -> Contacts:
     """One list of several."""
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
+
+
+def in_world(contacts: Contacts, x: Array, q: Array) -> Contacts:
+    """Contacts in the axes of a body at x (D, *batch) [m] and q (Q, *batch), in those of the world."""
+    so = rotations(len(x))
+    normal, point = (jax.vmap(so.rotate, (None, 0))(q, r) for r in (contacts.normal, contacts.point))
+    return Contacts(gap=contacts.gap, normal=normal, point=point + x[None])
 
 
 def slack_of(size: Array) -> Array:

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.collide.contacts import ALERT, FAR, Contacts, joined, slack_of
+from diffrigid.collide.contacts import ALERT, FAR, Contacts, in_world, joined, slack_of
 from diffrigid.collide.distance import core_distance, reach
 from diffrigid.collide.edges import CROSSINGS, Edges, are_outermost, crossing, edges_of
 from diffrigid.numerics import components, dot, norm, normalise, safe_divide
@@ -125,8 +125,7 @@ def _contacts(
         own = edges_of(a, corners - middle[None])
         ridges = _nearest(_ridges(own, around, deepest, size, slack, radius(a)), count, None)
         c = joined(c, _moved(joined(peaks, ridges), middle))
-    normal, point = (jax.vmap(lambda r: so.rotate(q_b, r))(r) for r in (c.normal, c.point))
-    return Contacts(gap=c.gap, normal=normal, point=point + x_b[None])
+    return in_world(c, x_b, q_b)
 
 
 def _cells_of_corners(a, b: HeightField) -> Any:

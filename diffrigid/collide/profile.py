@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.collide.contacts import ALERT, FAR, Contacts, joined, slack_of
+from diffrigid.collide.contacts import ALERT, FAR, Contacts, in_world, joined, slack_of
 from diffrigid.collide.distance import core_distance, reach
 from diffrigid.numerics import dot, norm, normalise
 from diffrigid.shapes import Disc, Profile, radius, vertices
@@ -45,8 +45,7 @@ def convex_profile(a, x_a: Array, q_a: Array, b: Profile, x_b: Array, q_b: Array
 
         parts.append(_vertex_contacts(b, distance, radius(a), slack, alert))
     c = joined(*parts)
-    normal, point = (jax.vmap(lambda r: so.rotate(q_b, r))(r) for r in (c.normal, c.point))
-    return Contacts(gap=c.gap, normal=normal, point=point + x_b[None])
+    return in_world(c, x_b, q_b)
 
 
 def on_next_segments(a, b: Profile, rests: Array) -> Array:

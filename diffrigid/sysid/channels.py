@@ -14,9 +14,9 @@ from diffrigid import joint_motion
 from diffrigid.convert import nearest, numbers, unit_quaternion
 from diffrigid.paths import component
 from diffrigid.pytree import array_fields, letters_of, replace
-from diffrigid.state import State
+from diffrigid.state import State, axis_sizes
 from diffrigid.sysid.sensors import Channel, Component, Function, JointPart, Part, is_turn, seen
-from diffrigid.world import World, axis_sizes
+from diffrigid.world import World
 
 FIELDS = ("x", "v", "w", "q", "angle")
 
@@ -28,7 +28,7 @@ def channel_of(name: str, what: Any, world: World) -> Channel:
         what: "ball.x", an observer, a function of the state, or a Channel around one of these.
     """
     channel = what if isinstance(what, Channel) else Channel(observer=what)
-    sizes = {"D": world.dim, "Q": 2 if world.dim == 2 else 4, "H": 3, "P": 2}
+    sizes = axis_sizes(world.dim) | {"H": 3, "P": 2}
     observer = _resolved(name, channel.observer, world, sizes)
     try:
         sizes["M"] = size_of(observer, world)
@@ -73,7 +73,7 @@ def _fill(sizes: dict[str, int], leaf: Any, letters: tuple[str, ...], path: str)
 
 def size_of(observer: Any, world: World) -> int:
     """Number of values that an observer returns for one time."""
-    sizes, count = axis_sizes(world), len(world.names)
+    sizes, count = axis_sizes(world.dim), len(world.names)
     shapes = {name: (count, sizes[letter]) for name, letter in zip("xqvw", "DQDA", strict=True)}
     dtype = jnp.result_type(world.bodies.mass)
     leaves: dict[str, Any] = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}

@@ -121,7 +121,7 @@ def _pose(points: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarra
     middle, center = r.mean(0), x.mean(0)
     spread = np.linalg.svd(r - middle, compute_uv=False)
     if spread[dim - 2] <= THIN * spread[0]:
-        return np.full(dim, np.nan), np.full(2 * dim - 2, np.nan)
+        return np.full(dim, np.nan), np.full(rotations(dim).Q, np.nan)
     U, _, V = np.linalg.svd((x - center).T @ (r - middle))
     U[:, -1] *= np.sign(np.linalg.det(U @ V))  # not a mirror image
     R = U @ V
@@ -150,7 +150,7 @@ def _turning(dim: int, t: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.nda
     """First orientation and angular velocity of quaternions (K, 2 or 4)."""
     so, rows = rotations(dim), np.flatnonzero(np.isfinite(q).all(1))[:ROWS]
     if not len(rows):
-        return np.full(q.shape[1], np.nan), np.full(2 * dim - 3, np.nan)
+        return np.full(q.shape[1], np.nan), np.full(so.A, np.nan)
     q = q[rows] / np.linalg.norm(q[rows], axis=1, keepdims=True)
     first = np.broadcast_to(q[0], q.shape).T
     turned = known(lambda a, b: so.log(so.difference(a, b)), first, q.T)  # in axes of the body
