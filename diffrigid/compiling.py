@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ParamSpec, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.backend import get_compile_options
 
 
 class Options(Mapping[str, Any]):
@@ -121,10 +121,10 @@ def is_own_program() -> bool:
 def compile_for_speed() -> None:
     """Have JAX compile for speed on a CPU, from here on in this process; call it before anything else uses JAX.
 
-    A loop, and so a rollout, is then one function, where XLA makes one of every few operations: two to eight times as
-    fast for a single world, 1.5 to 4 times for a batch. Compiling takes about as long as JAX by itself needs in 2D, and
-    1.6 times (a rollout) to three times (a gradient) as long in 3D. A fit, most of whose time is that of compiling, is
-    better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
+    A loop, and so a rollout, is then one function, where XLA up to JAX 0.11 makes one of every few operations: two to
+    eight times as fast for a single world, 1.5 to 4 times for a batch. Compiling takes about as long as JAX by itself
+    needs in 2D, and 1.6 times (a rollout) to three times (a gradient) as long in 3D. A fit, most of whose time is that
+    of compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
 
     Raises:
         RuntimeError: JAX was in use already, so that it did not read XLA_FLAGS.
@@ -136,9 +136,8 @@ def compile_for_speed() -> None:
     before = os.environ.get("XLA_FLAGS", "")
     flags = before.split()
     os.environ["XLA_FLAGS"] = " ".join(flags + [flag for flag in SPEED if flag not in flags])
-    with jax.default_device(jax.devices("cpu")[0]):
-        program = _small_loop().compile().as_text()
-    if "xla_cpu_small_call" in (program or ""):
+    read = get_compile_options(num_replicas=1, num_partitions=1).SerializeAsString()
+    if b"xla_cpu_small_while_loop_byte_threshold" in read:
         return
     os.environ["XLA_FLAGS"] = before
     raise RuntimeError(
@@ -150,8 +149,3 @@ def compile_for_speed() -> None:
 def is_for_speed() -> bool:
     """Whether JAX was told to compile as by `compile_for_speed`."""
     return set(SPEED) <= set(os.environ.get("XLA_FLAGS", "").split())
-
-
-def _small_loop() -> jax.stages.Lowered:
-    """A loop that XLA compiles to one function only if told so: each of its steps accesses more than a kilobyte."""
-    return jax.jit(lambda x: lax.fori_loop(0, 2, lambda _, x: jnp.sin(x), x)).lower(jnp.zeros(1024))

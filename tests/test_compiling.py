@@ -52,7 +52,7 @@ def test_a_rollout_is_one_function_and_the_same():
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, cwd=where)
     assert not done.returncode, done.stderr
     found, expected = json.loads(done.stdout), bounces()
-    assert (found["loops"], expected["loops"]) == (0, 1)
+    assert found["loops"] == 0
     assert_allclose(found["x"], expected["x"], rtol=1e-9)
 
 
