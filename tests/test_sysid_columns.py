@@ -306,6 +306,15 @@ def test_pieces_of_a_long_record_start_where_it_was_measured():
         assert_allclose(piece.observations["cue.x"][0][[0, -1]], (piece.start, piece.start + 0.5))
 
 
+def test_pieces_without_enough_rows_are_refused():
+    t = np.array([0.0, 0.1, 0.2, 0.3, 10.0])
+    gap = {"t": t, "cue.x": np.zeros((5, 2))}
+    late = {"cue.x": (10.0 * T, np.zeros((6, 2))), "cue.angle": (t[:4], t[:4])}
+    for data, message in ((gap, "'cue.x' from 0.3 to 6.66667 s: 1, expected"), (late, "'cue.angle' from 1 to 3.33333 s: 0")):
+        with pytest.raises(ValueError, match=message):
+            dr.segments(WORLD, STATE, data, 3)
+
+
 def states_to_begin_with(scene, records, free):
     kinds = {name: dr.each(kind) for name, kind in free.items()}
     return [run.state for run in sysid.make_problem(*scene, records, free=kinds).runs]

@@ -42,6 +42,9 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
 
     Positions, angles and orientations that are measured, and their velocities; the others are those of `state`.
 
+    Raises:
+        ValueError: columns that `fit` does not take; a piece with fewer than two rows of a column.
+
     Example:
         >>> [piece.start for piece in dr.segments(world, state, measured, 3)]
         [0.0, 0.16666666666666666, 0.3333333333333333]
@@ -57,6 +60,11 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
     for start, end in itertools.pairwise(edges):
         start = max(s.t[s.t <= start + SAME][-1] for s in series if (s.t <= start + SAME).any())
         use = {s.name: (s.t >= start - SAME) & (s.t <= end + SAME) for s in series}
+        if few := [name for name, rows in use.items() if rows.sum() < 2]:
+            raise ValueError(
+                f"count is {count}: rows of {few[0]!r} from {start:g} to {end:g} s: {use[few[0]].sum()}, expected two "
+                "or more in each segment; use fewer"
+            )
         pieces = {s.name: (s.t[use[s.name]], s.values[use[s.name]]) for s in series}
         pieces |= {c.name: (c.t, c.values) for c in controls}
         own = with_values(world, state, shown(world, series, channels, start))
