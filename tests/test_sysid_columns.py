@@ -190,9 +190,12 @@ def test_a_file_as_spreadsheets_write_it(tmp_path):
     read = read_csv(tmp_path / "semicolons.csv")
     assert_array_equal(read["t"], [0.5, 1.0])
     assert_array_equal(read["cue.x[0]"], [1.5, np.nan])
-    (tmp_path / "lost.csv").write_text("t,cue.x[0]\n0,1\n1,lost\n")
-    with pytest.raises(ValueError, match=r"lost.csv, row 3, column 'cue.x\[0\]' is 'lost': expected numbers"):
+    (tmp_path / "lost.csv").write_text("# a remark\nt,cue.x[0]\n\n0,1\n1,lost\n")
+    with pytest.raises(ValueError, match=r"lost.csv, line 5, column 'cue.x\[0\]' is 'lost': expected numbers"):
         read_csv(tmp_path / "lost.csv")
+    (tmp_path / "twice.csv").write_text("t,cue.x[0],note,cue.x[0],note\n0,1,a,2,b\n")
+    with pytest.raises(ValueError, match=r"two columns have the name 'cue.x\[0\]'"):
+        read_csv(tmp_path / "twice.csv", ["note"])
 
 
 def test_columns_that_are_none_of_the_fit_are_left_out(tmp_path):
@@ -310,7 +313,10 @@ def test_pieces_without_enough_rows_are_refused():
     t = np.array([0.0, 0.1, 0.2, 0.3, 10.0])
     gap = {"t": t, "cue.x": np.zeros((5, 2))}
     late = {"cue.x": (10.0 * T, np.zeros((6, 2))), "cue.angle": (t[:4], t[:4])}
-    for data, message in ((gap, "'cue.x' from 0.3 to 6.66667 s: 1, expected"), (late, "'cue.angle' from 1 to 3.33333 s: 0")):
+    for data, message in (
+        (gap, "'cue.x' from 0.3 to 6.66667 s: 1, expected"),
+        (late, "'cue.angle' from 1 to 3.33333 s: 0"),
+    ):
         with pytest.raises(ValueError, match=message):
             dr.segments(WORLD, STATE, data, 3)
 

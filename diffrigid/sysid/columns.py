@@ -80,27 +80,31 @@ def read_csv(path: str | Path, left_out: Collection[str] = ()) -> dict[str, np.n
     """
     try:
         with open(Path(path), newline="", encoding="utf-8-sig") as file:  # a number would be an open file
-            lines = [line for line in file if line.strip() and not line.startswith("#")]
-        mark = next((mark for mark in ";\t" if lines and mark in lines[0]), ",")
-        rows = list(csv.reader(lines, delimiter=mark))
+            lines = {n: line for n, line in enumerate(file, 1) if line.strip() and not line.startswith("#")}
+        numbers, texts = list(lines), list(lines.values())
+        mark = next((mark for mark in ";\t" if texts and mark in texts[0]), ",")
+        reader = csv.reader(texts, delimiter=mark)
+        rows = [(numbers[reader.line_num - 1], row) for row in reader]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV file: {error}") from None
     if not rows:
         raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
-    names, body = [name.strip() for name in rows[0]], rows[1:]
-    for number, row in enumerate(body, start=2):
+    names, body = [name.strip() for name in rows[0][1]], [row for _, row in rows[1:]]
+    kept = [k for k, name in enumerate(names) if name not in left_out]
+    if twice := [names[k] for k in kept if names[k] in names[:k]]:
+        raise ValueError(f"{path}: two columns have the name {twice[0]!r}: rename one, or leave it out")
+    for number, row in rows[1:]:
         if len(row) != len(names):
-            raise ValueError(f"{path}, row {number}: {len(row)} cells, expected {len(names)}, one for each name")
+            raise ValueError(f"{path}, line {number}: {len(row)} cells, expected {len(names)}, one for each name")
         for name, cell in zip(names, row, strict=True):
             wanted = name not in left_out and cell.strip()
             if wanted and not _is_number(cell.replace(",", ".") if mark != "," else cell):
                 raise ValueError(
-                    f"{path}, row {number}, column {name!r} is {cell!r}: expected numbers under one line of names, "
+                    f"{path}, line {number}, column {name!r} is {cell!r}: expected numbers under one line of names, "
                     "empty where missing"
                 )
     if mark != ",":
         body = [[cell.replace(",", ".") for cell in row] for row in body]
-    kept = [k for k, name in enumerate(names) if name not in left_out]
     cells = np.array([[float(row[k]) if row[k].strip() else np.nan for k in kept] for row in body])
     return {names[k]: cells[:, j] if len(body) else np.zeros(0) for j, k in enumerate(kept)}
 
