@@ -274,6 +274,7 @@ def test_bad_input_of_a_fit(data, arguments, message):
         ({"cue.v[2]": dr.real()}, r"cue.v\[2\] is not a number"),
         ({"contact.width": dr.positive()}, "the widths to go through"),
         ({"ball.v": dr.direction()}, "a direction that is not zero"),
+        ({("cue.mass", "ball.v[0]"): dr.shares()}, "starts at .* expected numbers above zero, whose sum is kept"),
         ({"cue.mass": dr.interval(2, 3)}, "starts at 1.0, expected from 2 to 3"),
     ],
 )

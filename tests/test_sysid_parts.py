@@ -45,6 +45,10 @@ def test_every_inertia_is_one_of_some_masses():
     assert np.linalg.matrix_rank(slopes) == 6  # every symmetric change is reached
     with pytest.raises(ValueError, match=r"expected \(3, 3\)"):
         kind.size(())
+    for plate in (np.diag([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.3]).astype(np.float32)):
+        with pytest.raises(ValueError, match="expected that of a body with thickness; else principal=True"):
+            kind.check("free", plate)
+    kind.check("free", np.asarray(reference))
 
 
 def test_principal_moments_of_an_inertia_change_along_axes_that_stay():

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +22,12 @@ class Chart:
     size: Callable[[tuple[int, ...]], int]  # raises ValueError for a shape that the map does not take
     value: Callable[[Array, Array], Array]  # (z, reference) -> value
     spread: float  # standard deviation of the z of random starts
+    allows: Callable[[np.ndarray], Any]  # whether a value can be the reference
+    expected: str  # of it, in words
 
     def check(self, where: str, value: np.ndarray) -> None:
-        if not value.any():
-            raise ValueError(f"{where} starts at {value}, expected a {self.name} that is not zero")
+        if not self.allows(value):
+            raise ValueError(f"{where} starts at {value}, expected {self.expected}")
 
     def unbounded(self, reference: np.ndarray) -> np.ndarray:
         return np.zeros(self.size(np.shape(reference)))
@@ -51,7 +54,8 @@ def direction(spread: float = 0.5) -> Chart:
         >>> round(float(jnp.hypot(*down)), 6)
         9.81
     """
-    return Chart("direction", _direction_size, _turned_vector, float(coefficient("spread", spread)))
+    spread, expected = float(coefficient("spread", spread)), "a direction that is not zero"
+    return Chart("direction", _direction_size, _turned_vector, spread, np.any, expected)
 
 
 def rotation(spread: float = 0.5) -> Chart:
@@ -61,7 +65,8 @@ def rotation(spread: float = 0.5) -> Chart:
         >>> dr.rotation().value(jnp.array([np.pi / 2]), jnp.array([1.0, 0.0])).round(6).tolist()
         [0.0, 1.0]
     """
-    return Chart("rotation", _rotation_size, _turned_orientation, float(coefficient("spread", spread)))
+    spread, expected = float(coefficient("spread", spread)), "an orientation that is not zero"
+    return Chart("rotation", _rotation_size, _turned_orientation, spread, np.any, expected)
 
 
 def inertia(spread: float = 0.3, *, principal: bool = False) -> Chart:
@@ -78,8 +83,10 @@ def inertia(spread: float = 0.3, *, principal: bool = False) -> Chart:
     """
     if not isinstance(principal, bool):
         raise ValueError(f"inertia: principal is {principal!r}, expected True or False")
-    size, value = (_moments_size, _scaled_inertia) if principal else (_inertia_size, _physical_inertia)
-    return Chart("inertia", size, value, float(coefficient("spread", spread)))
+    spread, expected = float(coefficient("spread", spread)), "that of a body with thickness; else principal=True"
+    if principal:
+        return Chart("inertia", _moments_size, _scaled_inertia, spread, np.any, "an inertia that is not zero")
+    return Chart("inertia", _inertia_size, _physical_inertia, spread, _has_thickness, expected)
 
 
 def shares(spread: float = 0.5) -> Chart:
@@ -90,7 +97,8 @@ def shares(spread: float = 0.5) -> Chart:
         >>> masses.round(6).tolist()
         [0.5, 1.5]
     """
-    return Chart("shares", _shares_size, _same_sum, float(coefficient("spread", spread)))
+    spread, expected = float(coefficient("spread", spread)), "numbers above zero, whose sum is kept"
+    return Chart("shares", _shares_size, _same_sum, spread, _all_positive, expected)
 
 
 def _direction_size(shape: tuple[int, ...]) -> int:
@@ -133,6 +141,12 @@ def _second_moments(inertia: Array) -> Array:
     return 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=inertia.dtype) - inertia
 
 
+def _has_thickness(inertia: np.ndarray) -> bool:
+    """Whether the second moments are positive by more than rounding, so that they have a Cholesky factor."""
+    moments = np.asarray(_second_moments(jnp.asarray(inertia)))
+    return bool(np.linalg.eigvalsh(moments)[0] > 16.0 * np.finfo(moments.dtype).eps * np.trace(moments))
+
+
 def _inertia_of(moments: Array) -> Array:
     return jnp.trace(moments) * jnp.eye(3, dtype=moments.dtype) - moments
 
@@ -162,6 +176,10 @@ def _shares_size(shape: tuple[int, ...]) -> int:
     if len(shape) != 1 or shape[0] < 2:
         raise ValueError("shares: expected a tuple of two or more paths of numbers, whose sum is kept")
     return shape[0] - 1
+
+
+def _all_positive(value: np.ndarray) -> bool:
+    return bool((value > 0).all())
 
 
 def _same_sum(z: Array, reference: Array) -> Array:
