@@ -247,6 +247,11 @@ def fitted(**changes):
     return dr.fit(*pair(), arguments.pop("observations"), **arguments)
 
 
+def planned(**changes):
+    arguments = {"planned": {"t": T, "ball.x": None}, "free": FREE, "noise": {"ball.x": 1.0}} | changes
+    return dr.sysid.expected_intervals(*pair(), **arguments)
+
+
 def roll(**changes):
     return dr.rollout(*pair(), **{"dt": 0.1, "steps": 2} | changes)
 
@@ -318,6 +323,11 @@ FITS = {
     "CSV": (lambda v: fitted(observations=v), ("nowhere.csv", "", ".", Path("nowhere"))),
     "load_scene": (dr.load_scene, ("nowhere.json", None, 1.5, 0, "", ".", object(), {}, [])),
     "read_scene": (read_scene, ("nowhere.toml", None, 1.5, 10**6, "", ".", object(), {}, [])),
+    "planned": (lambda v: planned(planned=v), (*RECORD, None, {}, [], {"ball.x": None}, {"t": T}, {"t": T, 1: None}, {"t": T, "bal.x": None})),
+    "planned t": (lambda v: planned(planned={"t": v, "ball.x": None}), (*TIMES, None)),
+    "planned column": (lambda v: planned(planned={"t": T, "ball.x": v}), (*ODD, 1.0, T, np.zeros((4, 2)), (T, T))),
+    "planned noise": (lambda v: planned(noise=v), (*RECORD, None, {}, {"bal": 1.0}, {1: 1.0}, {"ball.x": "a"}, {"ball.x": -1.0})),
+    "launch planned": (lambda v: dr.sysid.best_launch(*pair(), v, free=FREE, noise={"ball.x": 1.0}, vary=FREE), (*RECORD, None, {"ball.x": None})),
     "segments count": (lambda v: dr.segments(*pair(), DATA, v), INTEGER),
     "segments": (lambda v: dr.segments(*pair(), v, 2), (*RECORD, None)),
 }  # fmt: skip

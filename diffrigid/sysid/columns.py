@@ -40,16 +40,15 @@ def columns(
     check_mapping("observe", observe)
     left_out = {name for name, what in observe.items() if what is None}
     table = {name: values for name, values in _table(observations, where, left_out).items() if name not in left_out}
-    if odd := [name for name in table if not isinstance(name, str)]:
-        raise ValueError(f"{where} has a column {odd[0]!r}: expected names of columns, such as 'ball.x'")
-    shared = None if "t" not in table else _times(table.pop("t"), f'{where}["t"]')
+    check_mapping(where, table)
+    shared = None if "t" not in table else as_times(table.pop("t"), f'{where}["t"]')
     gathered = _gather(table)
     if shared is None and not any(isinstance(values, tuple) for values in gathered.values()):
         raise ValueError(f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours')
     found, channels, controls, sizes = [], {}, [], controlled(world.forces)
     for name, values in gathered.items():
         if isinstance(values, tuple) and len(values) == 2:
-            t, values = _times(values[0], f"{where}[{name!r}]"), values[1]
+            t, values = as_times(values[0], f"{where}[{name!r}]"), values[1]
         elif shared is not None:
             t = shared
         else:
@@ -121,8 +120,9 @@ def _table(observations: Any, where: str, left_out: Collection[str]) -> dict[str
     return dict(observations)
 
 
-def _times(t: Any, where: str) -> np.ndarray:
-    t = _floats(t, where)
+def as_times(t: Any, where: str) -> np.ndarray:
+    """Check and convert times (K,) [s]."""
+    t = as_floats(t, where)
     if t.ndim != 1 or len(t) < 2:
         alone = "" if t.shape != (1,) else ": if the motion began earlier, put a row of NaN there, and start= says so"
         raise ValueError(f"{where} has shape {t.shape}: expected at least two increasing times{alone}")
@@ -143,7 +143,7 @@ def _fix_of_times(one: float, next_: float) -> str:
     return "if another run begins there, give each as a record, [first, second]; else sort by time"
 
 
-def _floats(values: Any, where: str) -> np.ndarray:
+def as_floats(values: Any, where: str) -> np.ndarray:
     """Convert a column to floats; masked values of a table are missing."""
     try:
         array: np.ndarray = np.asarray(np.ma.filled(np.ma.asarray(values, float), np.nan))
@@ -156,7 +156,8 @@ def _floats(values: Any, where: str) -> np.ndarray:
 
 def _odd_one(values: Any) -> str:
     """Say which of several values is no number; "" if that is not to be seen."""
-    for row, value in enumerate(values if isinstance(values, list | tuple | np.ndarray) else ()):
+    rows = isinstance(values, list | tuple) or isinstance(values, np.ndarray) and values.ndim > 0
+    for row, value in enumerate(values if rows else ()):
         if isinstance(value, str) and not _is_number(value):
             return f", with {value!r} in row {row}"
     return ""
@@ -174,6 +175,8 @@ def check_mapping(where: str, value: Any) -> None:
     """Raise ValueError unless a value is a dict by column, or None."""
     if value is not None and not isinstance(value, Mapping):
         raise ValueError(f"{where} is {value!r:.80}: expected a dict by name of column")
+    if odd := [name for name in value or () if not isinstance(name, str)]:
+        raise ValueError(f"{where} has a column {odd[0]!r}: expected names of columns, such as 'ball.x'")
 
 
 def _gather(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -203,12 +206,12 @@ def _filled(values: Any, rows: int, size: int, name: str, where: str, world: Wor
             raise ValueError(f"{where}: component [{bad[0]}] of {size} in this {world.dim}D world")
         whole = np.full((rows, size), np.nan)
         for index, part in values.items():
-            part = _floats(part, f"{where}[{index}]")
+            part = as_floats(part, f"{where}[{index}]")
             if part.shape != (rows,):
                 raise ValueError(f"{where}[{index}] has shape {part.shape}, expected ({rows},) like t")
             whole[:, index] = part
         return whole
-    values = _floats(values, where)
+    values = as_floats(values, where)
     values = values[:, None] if values.ndim == 1 else values
     if values.shape == (rows, 1) != (rows, size):
         parts = " and ".join(f"{name}[{k}]" for k in range(size))

@@ -13,6 +13,7 @@ from diffrigid.convert import at_least_one, nearest
 from diffrigid.paths import component, unit
 from diffrigid.state import State
 from diffrigid.sysid.channels import channel_of
+from diffrigid.sysid.columns import as_floats, as_times, check_mapping
 from diffrigid.sysid.covariance import Linear, from_jacobian
 from diffrigid.sysid.diagnosis import Coordinate, blind_directions, infinite_where_blind
 from diffrigid.sysid.intervals import coordinates_of, interval_of, unit_of, unseen_of
@@ -25,7 +26,7 @@ from diffrigid.sysid.setup import Problem, first_numbers, first_value, make_prob
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import rows_of
 from diffrigid.tables import lined_up
-from diffrigid.world import World
+from diffrigid.world import World, check
 
 EXPECTED = ("parameter", "value", "expected 95 % interval", "unit")
 NUDGE = 1e-3  # change of z for differences
@@ -67,6 +68,9 @@ def expected_intervals(
         planned: "t" and the columns, with None for values, or NaN where nothing will be measured.
         noise: standard deviation of every column.
 
+    Raises:
+        ValueError: no times, or a planned column without noise; what `fit` does not take.
+
     Example:
         >>> planned = {"t": np.linspace(0.0, 1.0, 11), "ball.x": None}
         >>> one = {"spring.stiffness": dr.positive()}
@@ -89,6 +93,9 @@ def blind_spots(
     observe: Mapping[str, Any] | None = None, dt: float | None = None,
 ) -> tuple[str, ...]:  # fmt: skip
     """Say what these observations cannot determine, before any fit, at the values of the scene. Arguments of `fit`.
+
+    Raises:
+        ValueError: what `fit` does not take.
 
     Example:
         >>> made, start = dr.scene({"ball": ball}, forces={"spring": spring})
@@ -161,7 +168,12 @@ def _descended(scores: Callable, u: np.ndarray, steps: int) -> tuple[np.ndarray,
 
 
 def _problem(world: World, state: State, states: Sequence[State], planned, free, noise, observe, dt) -> Problem:
-    t, acting, observe = np.asarray(planned["t"], float), controlled(world.forces), observe or {}
+    check(world, state)
+    for where, given in (("planned", planned), ("noise", noise), ("observe", observe)):
+        check_mapping(where, given)
+    if "t" not in (planned or {}):
+        raise ValueError(f'planned is {planned!r:.80}: expected a dict with a column "t" of times [s]')
+    t, acting, observe = as_times(planned["t"], 'planned["t"]'), controlled(world.forces), observe or {}
     columns = {name: values for name, values in planned.items() if name == "t" or name in acting}
     kept, wholes = set(), {name: _whole(name, observe) for name in planned if name not in columns}
     for name, whole in wholes.items():
@@ -185,7 +197,7 @@ def _whole(name: str, observe: Mapping[str, Any]) -> str:
 def _zeros(world: World, name: str, values: Any, rows: int, observe: Mapping[str, Any]) -> np.ndarray:
     """Values of a planned column: zeros, NaN where nothing will be measured; as for all rows if they are None."""
     if values is not None:
-        return np.where(np.isfinite(np.asarray(values, float)), 0.0, np.nan)
+        return np.where(np.isfinite(as_floats(values, f"planned[{name!r}]")), 0.0, np.nan)
     whole = _whole(name, observe)
     size = channel_of(whole, observe.get(whole, whole), world).bias.shape[0]
     return np.zeros((rows, size) if whole == name else rows)
