@@ -60,10 +60,11 @@ def test_page_is_small_and_loads_nothing():
 
 def test_notebook_frame_holds_the_page_and_file_too(tmp_path):
     run = bounce()
-    player = dr.play({"</script><b>": run, "b & 'c'": run}, title="<i>")
+    player = dr.play({"</script><b>": run, "b & 'c'": run}, title="<i>", show=iter(["trails"]))
     srcdoc = re.search(r'srcdoc="([^"]*)"', player._repr_html_())[1]
     assert html.unescape(srcdoc) == player.page == player.save(tmp_path / "a.html").read_text(encoding="utf-8")
     assert [part["name"] for part in content(player)["runs"]] == ["</script><b>", "b & 'c'"]
+    assert content(player)["show"] == ["trails"]
     assert "<i>" not in player.page and 'sandbox="allow-scripts"' in run._repr_html_()
 
 

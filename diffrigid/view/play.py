@@ -105,23 +105,24 @@ def play(
         if isinstance(trajectory, Mapping)
         else {"": checked(trajectory)}
     )
+    show = frozenset(show)
     _check(runs, show, theme, speed, frames)
     by_run = _data_by_run(runs, data, beside)
     dim = next(iter(runs.values())).world.dim
     if plot not in PLOTS[dim]:
         raise ValueError(f"plot is {plot!r}: expected one of {PLOTS[dim]}")
     content = {
-        "dim": dim, "beside": bool(beside), "speed": float(speed), "show": sorted(set(show)), "plot": plot,
+        "dim": dim, "beside": bool(beside), "speed": float(speed), "show": sorted(show), "plot": plot,
         "runs": [record(run, name, by_run[name], frames) for name, run in runs.items()],
     }  # fmt: skip
     return Player(page=_page(content, dim, theme, title), height=int(height))
 
 
-def _check(runs: Mapping[str, Trajectory], show: Iterable[str], theme: str, speed: float, frames: int) -> None:
+def _check(runs: Mapping[str, Trajectory], show: frozenset[str], theme: str, speed: float, frames: int) -> None:
     dims = {name: run.world.dim for name, run in runs.items()}
     if len(set(dims.values())) != 1:
         raise ValueError(f"play: expected trajectories of one dimension, at least one, got {dims}")
-    if unknown := set(show) - set(SHOWN):
+    if unknown := show - set(SHOWN):
         raise ValueError(f"show has {sorted(unknown)}: expected some of {SHOWN}")
     if theme not in THEMES:
         raise ValueError(f"theme is {theme!r}: expected one of {THEMES}")
