@@ -46,9 +46,9 @@ def as_controls(
             raise ValueError(f"controls has no {name!r}: give controls={{{name!r}: ...}} of shape {(*steps, size)}.")
     if not isinstance(controls, Mapping) or any(name not in sizes for name in controls):
         if all(isinstance(force, FORCES) for force in forces):
-            unused = sorted(set(given) - set(sizes)) or [repr(controls)]
-            hint = nearest(unused[0], sizes) if sizes else "give Force or Torque a control."
-            raise ValueError(f"controls: no force takes {', '.join(unused)}: {hint}")
+            unused = [name for name in given if name not in sizes] or [controls]
+            hint = nearest(str(unused[0]), sizes) if sizes else "give Force or Torque a control."
+            raise ValueError(f"controls: no force takes {', '.join(map(repr, unused))}: {hint}")
 
     whole_controls = [given[name] for name in sizes]  # a list of numbers is one array
 

@@ -283,7 +283,8 @@ def test_a_batch_leaves_controls_of_other_forces_as_they_are():
     [
         (None, r"controls has no 'push': give controls=\{'push': ...\} of shape \(4, 2\)"),
         ({"pusch": np.zeros((4, 2))}, "controls has no 'push'"),
-        ({"push": np.zeros((4, 2)), "pull": np.zeros((4, 2))}, "no force takes pull: did you mean 'push'"),
+        ({"push": np.zeros((4, 2)), "pull": np.zeros((4, 2))}, "no force takes 'pull': did you mean 'push'"),
+        ({"push": np.zeros((4, 2)), 0: np.zeros((4, 2)), "pull": 1.0}, "no force takes 0, 'pull': there are push"),
         ({"push": np.zeros((3, 2))}, r"controls\['push'\] has shape \(3, 2\): expected \(4, 2\)"),
         ({"push": np.full((4, 2), np.nan)}, "expected finite numbers"),
         ({"push": "hard"}, "expected numbers"),
@@ -293,7 +294,7 @@ def test_a_batch_leaves_controls_of_other_forces_as_they_are():
 def test_wrong_controls(controls, message):
     with pytest.raises(ValueError, match=message):
         dr.rollout(*pushed(), dt=0.1, steps=4, controls=controls)
-    with pytest.raises(ValueError, match="no force takes push: give Force or Torque a control"):
+    with pytest.raises(ValueError, match="no force takes 'push': give Force or Torque a control"):
         dr.rollout(*dr.scene({"ball": PUCK}), dt=0.1, steps=4, controls={"push": np.zeros((4, 2))})
 
 
