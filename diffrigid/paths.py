@@ -1,6 +1,7 @@
 """Names of parameters: a path such as "ball.mass" and the leaf, or the part of one, that it stands for.
 
-restitution, friction, ..., gravity      a coefficient of all bodies and statics, their own too; the gravity vector
+restitution, friction, ...               a coefficient of all bodies and statics, their own too
+gravity                                  the gravity vector, of the one force that is gravity
 contact.width, contact.rest_speed        numbers of the contact model
 FORCE.field                              a force of the scene, by its name: "drag.linear"
 JOINT.field                              a joint of the scene, by its name: "revolute.anchor_a"
@@ -174,7 +175,14 @@ def hint(world: World, path: str, known: Iterable[str]) -> str:
         return f"it was left out when the scene was made: give {owner} a {field} to begin with."
     if owner in dict(joints) and field in joint_motion.fields_of(owners[owner]):
         return f"{owner} is part of a closed loop, so that what hangs on it cannot be moved alone: set bodies instead."
+    if path == "gravity" and (several := _gravities(world)):
+        return f"there are {len(several)}: use {' or '.join(f'{name}.g' for name in several)}."
     return nearest(path, known)
+
+
+def _gravities(world: World) -> list[str]:
+    """Names of the forces that are gravity."""
+    return [name for name, force in zip(world.force_names, world.forces, strict=True) if isinstance(force, Gravity)]
 
 
 def component(path: str) -> tuple[str, int | None]:
@@ -207,7 +215,7 @@ def catalogue(world: World) -> Catalogue:
         for field in array_fields(force):
             if getattr(force, field) is not None:
                 out[f"{name}.{field}"] = [Place((0, "forces", index, field), None)]
-        if isinstance(force, Gravity):
+        if isinstance(force, Gravity) and len(_gravities(world)) == 1:
             out["gravity"] = [Place((0, "forces", index, "g"), None)]
     for group, (names, joint) in enumerate(zip(world.joint_names, world.joints, strict=True)):
         for row, name in enumerate(names):

@@ -135,6 +135,14 @@ def test_unknown_paths_list_the_nearest(path, near):
         paths.read(*FLAT, path)
 
 
+def test_of_two_gravities_each_has_its_own_path():
+    bodies = {"a": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 0.0))}
+    scene = dr.scene(bodies, gravity=(0.0, -9.81), forces={"moon": dr.Gravity(g=(0.0, -1.62))})
+    assert paths.read(*scene, "gravity.g[1]") == -9.81
+    with pytest.raises(ValueError, match="no parameter 'gravity' in this world: there are 2: use gravity.g or moon.g"):
+        paths.read(*scene, "gravity")
+
+
 @pytest.mark.parametrize(
     "path, value, message",
     [
