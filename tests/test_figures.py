@@ -48,23 +48,37 @@ def test_phase_is_velocity_against_position(ax):
     falling = T < IMPACT
     curve = lines(view.phase(bounce(), "ball", "y", ax=ax))["ball"][falling]
     np.testing.assert_allclose(curve[:, 1] ** 2, 2 * G * (HEIGHT + RADIUS - curve[:, 0]), atol=1e-9)
-    with pytest.raises(ValueError, match="bodies are"):
-        view.phase(bounce(), "bal", ax=ax)
-    with pytest.raises(ValueError, match="2D"):
-        view.strobe(bounce(3), ax=ax)
 
 
 def test_film_has_a_picture_for_every_thirtieth_of_a_second(tmp_path):
-    pytest.importorskip("matplotlib").use("Agg")
+    pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
     with image.open(view.film(bounce(), tmp_path / "motion.gif", speed=2.0)) as film:
         assert film.n_frames == 14
-    with pytest.raises(ValueError, match="ffmpeg"):
-        view.film(bounce(), tmp_path / "motion.avi")
+
+
+def test_what_is_refused_leaves_no_figure_open(tmp_path):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("Agg")
+    run, file = bounce(), tmp_path / "motion.gif"
+    for draw, message in (
+        (lambda: view.strobe(bounce(3)), "2D"),
+        (lambda: view.strobe(run, pictures=0), "pictures is 0, expected an integer >= 1"),
+        (lambda: view.phase(run, "bal"), "bodies are"),
+        (lambda: view.film(bounce(3), file), "2D"),
+        (lambda: view.film(run, tmp_path / "motion.avi"), "ffmpeg"),
+        (lambda: view.film(run, file, speed=0.0), "speed is 0: expected above 0; 1 is real time"),
+        (lambda: view.film(run, file, rate=0), "rate is 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            draw()
+    assert pyplot.get_fignums() == []
 
 
 def test_without_matplotlib_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"diffrigid\[notebook\]"):
         view.energy(bounce())
+    with pytest.raises(ImportError, match=r"diffrigid\[notebook\]"):
+        view.film(bounce(), "motion.gif")
     assert dr.play(bounce()).page  # and the player does not need it

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from diffrigid import state as of_state
+from diffrigid.convert import at_least_one, positive
 from diffrigid.touch import rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.view.frames import energies
@@ -20,11 +21,15 @@ if TYPE_CHECKING:
 
 
 def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
-    """Draw the outlines of all bodies at evenly spaced stored times, the later the darker, and their paths [m]. 2D."""
-    world, ax = checked(trajectory).world, _axes(ax)
+    """Draw the outlines of all bodies at evenly spaced stored times, the later the darker, and their paths [m]. 2D.
+
+    Raises:
+        ValueError: a motion in 3D, or many; pictures < 1.
+    """
+    world, pictures = checked(trajectory).world, at_least_one("pictures", pictures)
     if world.dim != 2:
         raise ValueError("strobe draws 2D motions: for 3D use play, or plot components of state.x")
-    (x, q), shapes = _poses(trajectory), _outlines(world)
+    (x, q), shapes, ax = _poses(trajectory), _outlines(world), _axes(ax)
     rows = np.unique(np.rint(np.linspace(0, len(x) - 1, pictures)).astype(int))
     for owner, lines in shapes:
         for n in rows if owner < len(world.names) else ():
@@ -37,16 +42,21 @@ def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
 
 
 def film(trajectory: Trajectory, path: str | Path, speed: float = 1.0, rate: int = 30) -> Path:
-    """Write a 2D motion as .gif, or as .mp4 if ffmpeg is there, at `rate` pictures a second; `speed` 1 is real time."""
-    world, ax, path = checked(trajectory).world, _axes(None), Path(path)
+    """Write a 2D motion as .gif, or as .mp4 if ffmpeg is there, at `rate` pictures a second; `speed` 1 is real time.
+
+    Raises:
+        ValueError: a motion in 3D, or many; speed that is not above 0, or rate < 1; a file that cannot be written.
+    """
+    world, path = checked(trajectory).world, Path(path)
+    speed, rate = float(positive("speed", speed, "1 is real time")), at_least_one("rate", rate)
     if world.dim != 2:
         raise ValueError("film draws 2D motions: for 3D use play")
-    from matplotlib import animation, pyplot
-
+    animation, figure, _ = _matplotlib()
     kinds: dict[str, Any] = {".gif": animation.PillowWriter, ".mp4": animation.FFMpegWriter}
     if path.suffix not in kinds or not kinds[path.suffix].isAvailable():
         raise ValueError(f"film: cannot write {path.name!r}: use .gif, which needs pillow, or .mp4, which needs ffmpeg")
     (x, q), shapes, t = _poses(trajectory), _outlines(world), np.asarray(trajectory.t, float)
+    ax = figure.Figure().subplots()
     _stage(ax, world, x, shapes)
     moving = [(owner, lines) for owner, lines in shapes if owner < len(world.names)]
     curves = [ax.plot([], [], color=f"C{owner}")[0] for owner, _ in moving]
@@ -57,12 +67,15 @@ def film(trajectory: Trajectory, path: str | Path, speed: float = 1.0, rate: int
             for (owner, lines), curve in zip(moving, curves, strict=True):
                 curve.set_data(*(x[n, owner] + rotated(q[n, owner], lines)).T)
             writer.grab_frame()
-    pyplot.close(ax.figure)
     return path
 
 
 def energy(trajectory: Trajectory, ax: Any = None) -> Any:
-    """Plot kinetic, potential (gravity and springs) and total energy [J] of all bodies over time."""
+    """Plot kinetic, potential (gravity and springs) and total energy [J] of all bodies over time.
+
+    Raises:
+        ValueError: many motions.
+    """
     world, ax, t = checked(trajectory).world, _axes(ax), np.asarray(trajectory.t)
     for column, name in zip(energies(world, trajectory.state).T, ("kinetic", "potential", "total"), strict=True):
         ax.plot(t, column, label=name, color="k" if name == "total" else None)
@@ -70,7 +83,11 @@ def energy(trajectory: Trajectory, ax: Any = None) -> Any:
 
 
 def momentum(trajectory: Trajectory, angular: bool = False, ax: Any = None) -> Any:
-    """Plot the momentum of all bodies [N s] over time, or their angular momentum about the origin [N m s]."""
+    """Plot the momentum of all bodies [N s] over time, or their angular momentum about the origin [N m s].
+
+    Raises:
+        ValueError: many motions.
+    """
     world, ax, t = checked(trajectory).world, _axes(ax), np.asarray(trajectory.t)
     last = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), 0, -1), trajectory.state)
     of = of_state.angular_momentum if angular else of_state.momentum
@@ -81,12 +98,16 @@ def momentum(trajectory: Trajectory, angular: bool = False, ax: Any = None) -> A
 
 
 def phase(trajectory: Trajectory, body: str, axis: str = "x", ax: Any = None) -> Any:
-    """Plot velocity [m/s] against position [m] of a body along an axis, or angular velocity against "angle" (2D)."""
-    world, ax, state = checked(trajectory).world, _axes(ax), trajectory.state
+    """Plot velocity [m/s] against position [m] of a body along an axis, or angular velocity against "angle" (2D).
+
+    Raises:
+        ValueError: many motions; no such body or axis.
+    """
+    world, state = checked(trajectory).world, trajectory.state
     names = ["x", "y", "angle"] if world.dim == 2 else ["x", "y", "z"]
     if body not in world.names or axis not in names:
         raise ValueError(f"phase: no {axis!r} of {body!r}: bodies are {world.names}, axes {names}")
-    k, row = world.names.index(body), names.index(axis)
+    k, row, ax = world.names.index(body), names.index(axis), _axes(ax)
     if axis == "angle":
         q = np.asarray(state.q)[:, k]
         ax.plot(np.unwrap(np.arctan2(q[:, 1], q[:, 0])), np.asarray(state.w)[:, k, 0], label=body)
@@ -126,13 +147,16 @@ def _stage(ax: Any, world: "World", x: np.ndarray, shapes: list) -> None:
 
 
 def _axes(ax: Any) -> Any:
-    if ax is not None:
-        return ax
+    return _matplotlib()[2].subplots()[1] if ax is None else ax
+
+
+def _matplotlib() -> tuple[Any, Any, Any]:
+    """The modules animation, figure and pyplot."""
     try:
-        from matplotlib import pyplot
+        from matplotlib import animation, figure, pyplot
     except ImportError:
         raise ImportError('figures need matplotlib: pip install "diffrigid[notebook]"') from None
-    return pyplot.subplots()[1]
+    return animation, figure, pyplot
 
 
 def _labelled(ax: Any, across: str, up: str) -> Any:
