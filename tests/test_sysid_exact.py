@@ -280,6 +280,9 @@ def test_a_saved_fit_is_read_back_and_resumed(fit, records, tmp_path):
     assert {"diffrigid", "jax", "numpy"} <= set(json.loads((tmp_path / "fit.json").read_text())["versions"])
     again = dr.fit(*point(), records, free=FREE, progress=False, resume=saved, iterations=1)
     assert_allclose(again["p.x"].value, fit["p.x"].value, atol=1e-6)
+    for use in (lambda fit: dr.profile(fit, "gravity"), dr.sample, sysid.jumps, sysid.residual_figure):
+        with pytest.raises(ValueError, match=r"expected a Fit; what load_fit read is its table only: dr.fit\("):
+            use(saved)
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(ValueError, match="not a saved fit"):
         dr.load_fit(tmp_path / "other.json")

@@ -8,7 +8,7 @@ from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.intervals import number_names
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import ProfileLikelihood
-from diffrigid.sysid.result import Fit, checked_record
+from diffrigid.sysid.result import Fit, checked_fit, checked_record
 
 
 def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:
@@ -22,6 +22,7 @@ def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:
 
 def residual_figure(fit: Fit, record: int = 0) -> Any:
     """Residuals of a record over time, in standard deviations."""
+    checked_fit(fit, "residual_figure")
     figure, axes = _axes()
     for series in fit.problem.runs[checked_record(fit, record)].series:
         values = fit.residuals[record][series.name][: len(series.t)]
@@ -49,6 +50,7 @@ def cost_figure(fit: Fit) -> Any:
 
 def correlation_figure(fit: Fit) -> Any:
     """Correlations of the shared numbers."""
+    checked_fit(fit, "correlation_figure")
     figure, axes = _axes(5.0, 4.2)
     names = number_names(fit.problem)
     image = axes.imshow(correlations(fit.covariance), vmin=-1, vmax=1, cmap="RdBu")

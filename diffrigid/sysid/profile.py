@@ -10,7 +10,7 @@ from diffrigid.convert import at_least_one
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, cost_of, levenberg
 from diffrigid.sysid.parameters import pieces
-from diffrigid.sysid.result import Fit
+from diffrigid.sysid.result import Fit, checked_fit
 from diffrigid.sysid.setup import reach_of
 from diffrigid.sysid.summary import Parameter
 
@@ -68,6 +68,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
         >>> bool(curve.low < 0.8 < curve.high), curve.open  # open: where the data give no limit
         (True, ())
     """
+    checked_fit(fit, "profile")
     if at_least_one("points", points) % 2 == 0 or points < 3:
         raise ValueError(f"points is {points}: expected an odd number from 3 on, the fitted value in the middle")
     kind, index = _kind_and_index(fit, name)
@@ -86,6 +87,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
 
 def with_profiles(fit: Fit, profiles: Sequence[ProfileLikelihood]) -> Fit:
     """The fit with the intervals of profiles in its table, and a note on those that are open."""
+    checked_fit(fit, "with_profiles")
     found = {p.name: p for p in profiles}
 
     def changed(p: Parameter) -> Parameter:

@@ -263,6 +263,15 @@ class Fit:
         return html_table(self.summary)
 
 
+def checked_fit(fit: Any, what: str) -> Fit:
+    """The fit, which `what` needs; a ValueError if it is something else, or only its table."""
+    if isinstance(fit, Summary):
+        raise ValueError(f"{what}: expected a Fit; what load_fit read is its table only: dr.fit(..., resume=saved)")
+    if not isinstance(fit, Fit):
+        raise ValueError(f"{what}: expected a Fit, got {fit!r:.80}")
+    return fit
+
+
 def checked_record(fit: Fit, record: int) -> int:
     """The number of a record of the fit; a ValueError if there is no such one."""
     if record not in range(len(fit.scenes)):

@@ -25,7 +25,7 @@ from diffrigid.sysid.intervals import coordinates_of, unit_of
 from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of
 from diffrigid.sysid.parameters import Slot, reference, split
 from diffrigid.sysid.problem import Data, Plan, linearised
-from diffrigid.sysid.result import Fit
+from diffrigid.sysid.result import Fit, checked_fit
 from diffrigid.sysid.setup import first_value, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import rows_of
@@ -79,6 +79,7 @@ def sample(fit: Fit, draws: int = 1000, *, chains: int = 4, warmup: int = 300, s
         >>> posterior["restitution"].shape, bool(posterior.parameters[0].low < 0.8 < posterior.parameters[0].high)
         ((2, 100), True)
     """
+    checked_fit(fit, "sample")
     nuts = _nuts()
     for name, count in (("draws", draws), ("chains", chains), ("warmup", warmup)):
         at_least_one(name, count)

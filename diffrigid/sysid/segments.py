@@ -29,7 +29,7 @@ from diffrigid.sysid.first_rows import shown, with_values
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import Each, each, real
 from diffrigid.sysid.records import SAME, Record
-from diffrigid.sysid.result import Fit
+from diffrigid.sysid.result import Fit, checked_fit
 from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.times import motion
 from diffrigid.world import World, check
@@ -114,6 +114,7 @@ def jumps(fit: Fit) -> dict[str, np.ndarray]:
         By "ball.x" [m], "ball.v" [m/s], "ball.w" [rad/s], (pieces - 1, D or A) in world axes; and by "ball.angle" or
         "ball.q" [rad], as a rotation vector in axes of the body.
     """
+    checked_fit(fit, "jumps")
     so, records = rotations(fit.world.dim), list(zip(fit.problem.runs, fit.scenes, strict=True))
     turned = "angle" if fit.world.dim == 2 else "q"
     out: dict[str, list[np.ndarray]] = {}
