@@ -1,5 +1,7 @@
 """The fit: known parameters from noisy and partly missing records, honest intervals, clear errors."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -7,6 +9,7 @@ from numpy.testing import assert_allclose
 import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.sysid.free import Free
+from diffrigid.view.fit_report import cost_chart
 
 NOISE = 3e-3  # [m]
 TRUTH = {"restitution": 0.8, "d1.mass": 2.0, "d0.v": np.array([2.0, 0.1])}
@@ -133,3 +136,6 @@ def test_starts_that_miss_are_another_order():
     assert f"; {len(groups[1])} of 8: " in repr(fit)
     axes = pytest.importorskip("matplotlib") and sysid.cost_figure(fit).axes[0]
     assert [len(line.get_xdata()) for line in axes.lines] == [len(members) for members in groups]
+    few = dataclasses.replace(fit, summary=dataclasses.replace(fit.summary, orders=fit.orders[:5]))  # as of 64 of more
+    assert sum(len(line.get_xdata()) for line in sysid.cost_figure(few).axes[0].lines) == 8
+    assert cost_chart(few).count("<circle") == 8 and "of the best 5 of 8 starts" in repr(few)

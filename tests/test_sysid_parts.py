@@ -145,7 +145,9 @@ def test_a_start_at_zero_of_a_positive_parameter_is_moved_off():
 def test_orders_of_impacts_in_words():
     bounces, hit = ("b-floor",) * 3, ("a-b", "b-floor")
     assert in_words(((bounces,),), 1) == "impacts: b-floor x 3"
-    assert in_words(((hit,), (hit,), ((),)), 4) == "impacts, 2 of 4 starts: a-b, b-floor; 1 of 4: none"
+    some = ((hit,), (hit,), ((),))
+    assert in_words(some, 3) == "impacts, 2 of 3 starts: a-b, b-floor; 1 of 3: none"
+    assert in_words(some, 9) == "impacts, 2 of the best 3 of 9 starts: a-b, b-floor; 1 of 3: none"
     assert in_words((((),), ((),)), 2) == ""
     two_records = ((hit, bounces), (hit, hit), (hit, bounces))
     assert in_words(two_records, 3) == "impacts of record 1, 2 of 3 starts: b-floor x 3; 1 of 3: a-b, b-floor"

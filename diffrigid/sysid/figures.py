@@ -37,13 +37,15 @@ def residual_figure(fit: Fit, record: int = 0) -> Any:
 
 
 def cost_figure(fit: Fit) -> Any:
-    """Cost at which each start ended, lowest first; a colour for each order of impacts."""
+    """Cost at which each start ended, lowest first; a colour for each order of impacts, grey where it is not known."""
     figure, axes = _axes()
     for number, members in enumerate(alike(fit.orders)):
         at = np.array(members)
         axes.semilogy(at + 1, fit.costs[at], "o", label=f"order of impacts {number + 1}")
+    if len(rest := np.arange(len(fit.orders), np.isfinite(fit.costs).sum())):
+        axes.semilogy(rest + 1, fit.costs[rest], "o", color="0.6", label="not looked at")
     axes.set(xlabel="start", ylabel="cost")
-    if len(alike(fit.orders)) > 1:
+    if len(axes.lines) > 1:
         axes.legend(fontsize="small")
     return figure
 

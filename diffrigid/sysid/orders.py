@@ -23,7 +23,7 @@ Orders = tuple[tuple[tuple[str, ...], ...], ...]
 
 
 def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
-    """Pairs that strike, in order of time, for the first `count` starts z and each of the first few records.
+    """Pairs that strike, in order of time, for the first `count` starts z, 64 at most, and each of three records.
 
     Motions have the steps of the fit, so that what is compiled already gives them.
     """
@@ -61,7 +61,8 @@ def alike(orders: Orders) -> list[tuple[int, ...]]:
 def in_words(orders: Orders, starts: int) -> str:
     """One line, "5 of 8 starts: cue-ball, ball-wall; 3 of 8: cue-wall"; "" where nothing strikes anything.
 
-    Of several records, it is about the first in which the starts differ.
+    Of several records, it is about the first in which the starts differ. Of more `starts` than there are orders, those
+    are the best.
     """
     groups = alike(orders)
     if not any(any(order) for order in orders):
@@ -69,10 +70,11 @@ def in_words(orders: Orders, starts: int) -> str:
     kinds = [orders[members[0]] for members in groups]
     record = next((k for k in range(len(kinds[0])) if len({order[k] for order in kinds}) > 1), 0)
     where = f" of record {record}" if len(kinds[0]) > 1 else ""
-    if starts == 1:
+    if len(orders) == 1:
         return f"impacts{where}: {_listed(kinds[0][record])}"
+    whole = f"{starts} starts" if len(orders) == starts else f"the best {len(orders)} of {starts} starts"
     parts = [
-        f"{len(members)} of {starts}{' starts' if not n else ''}: {_listed(order[record])}"
+        f"{len(members)} of {len(orders) if n else whole}: {_listed(order[record])}"
         for n, (members, order) in enumerate(zip(groups[:NAMED], kinds, strict=False))
     ]
     others = sum(map(len, groups[NAMED:]))

@@ -94,7 +94,7 @@ class Fit:
 
     @property
     def orders(self) -> Orders:
-        """Pairs that strike, in order, for each start, the best first, and for each of the first three records."""
+        """Pairs that strike, in order, for each of the best 64 starts, and for each of the first three records."""
         return self.summary.orders
 
     @property

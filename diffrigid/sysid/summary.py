@@ -41,7 +41,7 @@ class Summary:
     noise: dict[str, float]  # standard deviation of each column's residuals, in its unit
     costs: np.ndarray  # (starts,) the loss of the residuals, lowest first; inf: diverged
     agree: int  # starts that ended at the best cost
-    orders: Orders  # pairs that strike, in order of time, for each start, the best first, and each of the first records
+    orders: Orders  # pairs that strike, in order of time, for each of the best 64 starts and of the first three records
     notes: tuple[str, ...]  # what the data cannot tell, and why not to believe the intervals
     seed: int
     seconds: float

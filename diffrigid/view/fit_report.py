@@ -129,7 +129,7 @@ def _by_record(fit: "Fit") -> str:
 
 def _search(fit: "Fit", found: Sequence[ProfileLikelihood]) -> Section:
     names = number_names(fit.problem)
-    charts = [_costs(fit)] if len(fit.costs) > 1 else []
+    charts = [cost_chart(fit)] if len(fit.costs) > 1 else []
     if len(names) > 1:
         label = [f"{name}  {k + 1}" for k, name in enumerate(names)]
         charts.append(matrix("Correlations of the shared numbers", label, fit.correlation))
@@ -137,13 +137,15 @@ def _search(fit: "Fit", found: Sequence[ProfileLikelihood]) -> Section:
     return Section(title="How well it is found", charts=charts)
 
 
-def _costs(fit: "Fit") -> str:
-    """Chart of the cost at which every start ended, the lowest first, coloured by the order of impacts."""
+def cost_chart(fit: "Fit") -> str:
+    """Chart of the cost at which every start ended, the lowest first, coloured by the order of impacts, grey if unknown."""
     over = np.round(np.log10(fit.costs / max(fit.costs[0], 1e-300)), 3)
     groups = [np.array(members) for members in alike(fit.orders)]
     groups = [*groups[:2], np.concatenate(groups[2:])] if len(groups) > 2 else groups
-    names = ("order of the best", "another", "others") if len(groups) > 1 else ("",)
+    rest = np.arange(len(fit.orders), np.isfinite(fit.costs).sum())
+    names = ("order of the best", "another", "others") if len(groups) > 1 or len(rest) else ("",)
     curves = [Curve(at + 1.0, over[at], name, k, True) for k, (at, name) in enumerate(zip(groups, names, strict=False))]
+    curves += [Curve(rest + 1.0, over[rest], "not looked at", 3, True)] if len(rest) else []
     return chart("Cost of each start", "start", "log10 of cost / lowest", curves, margin=0.02)
 
 

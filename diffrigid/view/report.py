@@ -45,7 +45,7 @@ class Curve:
     x: np.ndarray
     y: np.ndarray
     name: str = ""  # of the legend; "" is not listed
-    colour: int = 0  # 0 to 2
+    colour: int = 0  # 0 to 2; 3 is grey
     points: bool = False
 
 
