@@ -17,7 +17,7 @@ NAMES = re.findall(r"^\.\. auto(?:function|class):: (\w+)$", PAGE, flags=re.M)  
 # What `dataclasses` and JAX describe, and what needs a crowd, in `tests/test_crowd.py`.
 ELSEWHERE = {"replace", "QUICK", "missed_pairs"}
 MORE = {"make_problem", "start_vector", "residual_vector", "jacobian_matrix", "first_order", "lbfgs", "best_launch"} | {
-    "missed_pairs", "fit_in_pieces", "jumps"
+    "values_at", "missed_pairs", "fit_in_pieces", "jumps"
 }  # fmt: skip
 
 

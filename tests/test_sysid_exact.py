@@ -263,7 +263,10 @@ def test_scipy_finds_the_same_from_the_public_functions(fit):
     functions = (partial(f, fit.problem) for f in (sysid.residual_vector, sysid.jacobian_matrix))
     residuals, jacobian = functions
     found = least_squares(residuals, sysid.start_vector(fit.problem), jacobian)
-    assert_allclose(found.x[:2], fit["gravity"].value, atol=1e-6)
+    values = sysid.values_at(fit.problem, found.x)
+    assert_allclose(values["gravity"], fit["gravity"].value, atol=1e-6)
+    assert_allclose(values["p.v"], fit["p.v"].value, atol=1e-6)
+    assert "p.v of each record" in repr(fit.problem)
     assert_allclose(found.cost, fit.costs[0], rtol=1e-9)
 
 

@@ -28,7 +28,7 @@ from diffrigid.sysid.result import Fit
 from diffrigid.sysid.sampling import sample
 from diffrigid.sysid.segments import fit_in_pieces, jumps, segments
 from diffrigid.sysid.sensors import Channel, Homography, Marker, Pinhole, Separation
-from diffrigid.sysid.setup import jacobian_matrix, make_problem, residual_vector, start_vector
+from diffrigid.sysid.setup import jacobian_matrix, make_problem, residual_vector, start_vector, values_at
 from diffrigid.sysid.summary import Parameter, load_fit
 
 __all__ = [
@@ -76,5 +76,6 @@ __all__ = [
     "squares",
     "start_vector",
     "student",
+    "values_at",
     "with_profiles",
 ]

@@ -2,7 +2,8 @@
 
 problem = make_problem(world, state, observations, free={"restitution": interval(0, 1)}, noise={"ball.x": 1e-3})
 residuals, jacobian = partial(residual_vector, problem), partial(jacobian_matrix, problem)
-scipy.optimize.least_squares(residuals, start_vector(problem), jacobian)
+found = scipy.optimize.least_squares(residuals, start_vector(problem), jacobian)
+values_at(problem, found.x)["restitution"]
 """
 
 import warnings
@@ -23,7 +24,7 @@ from diffrigid.step import floats
 from diffrigid.sysid.first_rows import begun
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers
-from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
+from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, pieces, put, reference, write
 from diffrigid.sysid.problem import Group, evaluate, full_turn, known, linearise, make_groups
 from diffrigid.sysid.records import Run, noise_guess, runs, series_of
 from diffrigid.sysid.times import longest_step
@@ -48,6 +49,12 @@ class Problem:
     noise: dict[str, float]  # of columns whose noise is not given with their record
     free: Mapping[Any, Any]  # as the user gave it
     observe: Mapping[str, Any]  # likewise
+
+    def __repr__(self) -> str:
+        """What is free, in how many records."""
+        a, b = self.sizes
+        names = [slot.name for slot in self.shared] + [f"{slot.name} of each record" for slot in self.own]
+        return f"<Problem of {a + b * len(self.runs)} numbers z and {len(self.runs)} records: {', '.join(names)}>"
 
     @property
     def slots(self) -> tuple[Slot, ...]:
@@ -295,6 +302,24 @@ def jacobian_matrix(problem: Problem, z: np.ndarray) -> np.ndarray:
             block[:, a + member * b : a + (member + 1) * b] = slopes[:, a:, k]
             blocks.append(block)
     return np.concatenate(blocks)
+
+
+def values_at(problem: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
+    """Values of the parameters at z (a + R b,), by name; those of each record stacked, NaN where it has no such."""
+    at, scenes = unpack(problem, z), [scene_of(run) for run in problem.runs]
+
+    def value(slot: Slot, z: Array, scene: Scene) -> np.ndarray:
+        found = np.asarray(slot.kind.value(z, reference(slot, scene)), float)
+        return found.reshape(()) if found.size == 1 else found
+
+    shared = [(slot, at.shared[rows, 0]) for slot, rows in pieces(problem.shared)]
+    out = {slot.name: value(slot, z, scene_having(problem, slot)) for slot, z in shared}
+    for slot, rows in pieces(problem.own):
+        has = [all(knows(scene, path) for path in slot.paths) for scene in scenes]
+        found = [value(slot, at.own[rows, r, 0], scenes[r]) for r in np.flatnonzero(has)]
+        out[slot.name] = np.full((len(scenes), *found[0].shape), np.nan)
+        out[slot.name][has] = found
+    return out
 
 
 def fitted_scenes(problem: Problem, shared: np.ndarray, own: np.ndarray) -> list[Scene]:
