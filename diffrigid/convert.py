@@ -308,6 +308,8 @@ def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
         array = numbers(path, leaf, None)
         if array.ndim == 0 and None not in axes:  # a number stands for all components
             array = (jnp if traced(array) else np).broadcast_to(array, axes)
+        if path.rpartition(".")[2] in getattr(force, "resist", ()) and not traced(array) and (array < 0).any():
+            raise ValueError(f"{path} is {leaf}: expected 0 or above, or the force would drive what it resists.")
         return numbers(path, array, None if None in axes else axes)
 
     return map_arrays(fill, replace(force, **changes), name)

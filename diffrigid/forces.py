@@ -7,7 +7,8 @@ attributes let the step skip work, and all default to the general case when abse
     uniform    every body has the same constant acceleration, so that relative paths are straight
     twists     the wrench has a torque
 
-A `planar` one is for 2D only. One that depends on the length of the step has `within`, see `GroundFriction`.
+A `planar` one is for 2D only. One that depends on the length of the step has `within`, see `GroundFriction`. Below 0,
+fields that `resist` motion are refused.
 """
 
 from typing import Any, ClassVar
@@ -59,6 +60,7 @@ class Drag:
     linear: Leaf = array("D", default=0.0)  # (D, *batch) [N s/m]; a number stands for all directions
     angular: Leaf = array(default=0.0)  # (*batch) [N m s/rad]
     quadratic: Leaf = array(default=None)  # (*batch) [N s^2/m^2]; None: none
+    resist: ClassVar[tuple[str, ...]] = ("linear", "angular", "quadratic")
     constant: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
     twists: ClassVar[bool] = True
@@ -102,6 +104,7 @@ class GroundFriction:
     arm: Leaf = array(default=None)
     g: Leaf = array(default=9.81)
     slow: Leaf = array(default=0.0)
+    resist: ClassVar[tuple[str, ...]] = ("friction", "arm", "g", "slow")
     constant: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
     twists: ClassVar[bool] = True
@@ -202,6 +205,7 @@ class SpringDamper:
     stiffness: Leaf = array()  # (*batch) [N/m]
     damping: Leaf = array(default=0.0)  # (*batch) [N s/m]
     length: Leaf = array(default=0.0)  # (*batch) [m] at rest
+    resist: ClassVar[tuple[str, ...]] = ("damping",)
     constant: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
     twists: ClassVar[bool] = True

@@ -92,6 +92,8 @@ def _encoded(value: Any, where: str) -> Any:
             raise ValueError(f"{where} is traced by jit, vmap or grad: save it outside, from the result")
         if not np.isfinite(value).all():
             raise ValueError(f"{where} is {value}: expected finite numbers")
+        if str(value.dtype) not in DTYPES:
+            raise ValueError(f"{where} is of {value.dtype}: expected one of {', '.join(DTYPES)}")
         return {"array": np.asarray(value).tolist(), "shape": list(value.shape), "dtype": str(value.dtype)}
     if isinstance(value, tuple | list):
         return [_encoded(part, f"{where}[{k}]") for k, part in enumerate(value)]

@@ -15,11 +15,12 @@ from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, at_least_one, largest, numbers
 from diffrigid.devices import on_cpu
+from diffrigid.pytree import map_arrays
 from diffrigid.scan import MEMORY, advance, aligned, joined, scan_steps
 from diffrigid.shapes import traced
 from diffrigid.state import State
 from diffrigid.trajectory import Trajectory
-from diffrigid.world import World, check, check_kinds
+from diffrigid.world import World, check, check_kinds, check_leaves, shape_of_leaf
 
 MUCH = 100_000_000  # [-] of `work`: beyond it a longer compilation pays
 A_BODY = 100  # work for a body or a joint, in numbers found by contacts
@@ -119,12 +120,19 @@ def missed_pairs(world: World, state: State, dt: Any) -> Array:
         ValueError: not a world and a state; dt <= 0.
     """
     check_kinds(world, state)
-    world, state = floats(world, state)
-    length, leading = step_length(dt, state), state.x.shape[:-2]
+    leading = shape_of_leaf(state.x, "state.x")[:-2]
+
+    def in_one_row(leaf: Any, letters: tuple[str, ...], path: str) -> Array:
+        shape = shape_of_leaf(leaf, path)
+        return jnp.reshape(leaf, (int(np.prod(shape[: len(leading)])), *shape[len(leading) :]))
+
+    states = map_arrays(in_one_row, state, "state")
+    check_leaves(world, states, batch_first=True)
+    world, states = floats(world, states)
+    length = step_length(dt, states)
     if not world.crowd:
         return jnp.zeros(leading, jnp.int32)
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(leading) :]), state)
-    return _missed_jit(world, flat, length).reshape(leading)
+    return _missed_jit(world, states, length).reshape(leading)
 
 
 def floats(world: World, state: State) -> tuple[World, State]:

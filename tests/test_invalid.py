@@ -167,11 +167,14 @@ SCENES = {
     "neighbours": (lambda v: flat(options={"contact": dr.Contact(neighbours=v)}), INTEGER),
 }  # fmt: skip
 FORCES = {
-    "Drag.linear": (lambda v: forced(dr.Drag(linear=v)), (*ODD, None, np.inf, (1.0, 2.0, 3.0), (np.nan, 0.0))),
+    "Drag.linear": (
+        lambda v: forced(dr.Drag(linear=v)),
+        (*ODD, None, np.inf, (1.0, 2.0, 3.0), (np.nan, 0.0), -0.1, (0.1, -0.1)),
+    ),
     "Drag.angular": (lambda v: forced(dr.Drag(angular=v)), (*NUMBER, None)),
     "GroundFriction.body": (lambda v: forced(dr.GroundFriction(v, friction=0.1)), NAME),
-    "GroundFriction.friction": (lambda v: forced(dr.GroundFriction(friction=v)), (*NUMBER, None)),
-    "GroundFriction.arm": (lambda v: forced(dr.GroundFriction(friction=0.1, arm=v)), NUMBER),
+    "GroundFriction.friction": (lambda v: forced(dr.GroundFriction(friction=v)), (*NUMBER, None, -0.1)),
+    "GroundFriction.arm": (lambda v: forced(dr.GroundFriction(friction=0.1, arm=v)), (*NUMBER, -0.1)),
     "Force.body": (lambda v: forced(dr.Force(body=v, F=(1.0, 0.0))), (*NAME, None)),
     "Force.F": (lambda v: forced(dr.Force(body="ball", F=v)), (*ODD, None, (1.0, 2.0, 3.0), np.inf)),
     "Force.point": (lambda v: forced(dr.Force(body="ball", F=1.0, point=v)), (*ODD, (1.0, 2.0, 3.0))),

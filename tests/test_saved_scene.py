@@ -83,6 +83,8 @@ def test_what_cannot_be_saved_or_read_is_refused(tmp_path):
         dr.load_scene(file, kinds=(Wind,))
     with pytest.raises(ValueError, match="(?s)state.v is .*nan.*: expected finite"):
         dr.save_scene(file, world, dr.replace(state, v=state.v * np.nan))
+    with pytest.raises(ValueError, match="state.v is of bfloat16: expected one of float16, float32, float64"):
+        dr.save_scene(tmp_path / "new.json", world, dr.replace(state, v=state.v.astype("bfloat16")))
     with pytest.raises(ValueError, match="state.v is traced"):
         jax.jit(lambda v: dr.save_scene(file, world, dr.replace(state, v=v)))(state.v)
     with pytest.raises(ValueError, match=r"expected \(world, state\)"):
