@@ -118,4 +118,4 @@ def test_agreement_of_chains():
 def test_without_the_extra_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "blackjax.mcmc", None)
     with pytest.raises(ImportError, match=r"diffrigid\[sampling\]"):
-        dr.sample(None)
+        dr.sample(object.__new__(dr.Fit))
