@@ -138,7 +138,7 @@ def _search(fit: "Fit", found: Sequence[ProfileLikelihood]) -> Section:
 
 
 def cost_chart(fit: "Fit") -> str:
-    """Chart of the cost at which every start ended, lowest first, coloured by the order of impacts; grey: unknown."""
+    """Chart of the cost at which every start ended, lowest first, coloured by the order of impacts, grey if unknown."""
     over = np.round(np.log10(fit.costs / max(fit.costs[0], 1e-300)), 3)
     groups = [np.array(members) for members in alike(fit.orders)]
     groups = [*groups[:2], np.concatenate(groups[2:])] if len(groups) > 2 else groups
