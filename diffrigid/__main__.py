@@ -99,7 +99,7 @@ def paragraphs(text: str, **values: Any) -> list[str]:
     return [" ".join(paragraph.format(**values).split()) for paragraph in text.strip().split("\n\n")]
 
 
-def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+def _options(arguments: Sequence[str]) -> argparse.Namespace:
     what = "Two identifications, one measured and one synthetic: a table, and a page for the browser."
     more = "To fit data of your own: python -m diffrigid fit scene.toml data.csv (see python -m diffrigid fit --help)."
     parser = argparse.ArgumentParser(prog="python -m diffrigid", description=what, epilog=more)

@@ -121,7 +121,7 @@ def joint_forces(so: ModuleType, sides: Array, groups: tuple[PlacedJoints, ...],
         sides: J as `joint_jacobian` has it. Not differentiated: the derivative of J^T lam is that of the transpose of
             J u, which takes a fraction of the derivative of all columns of J.
     """
-    del groups
+    del so, groups
     return functools.reduce(jnp.add, (sides[:, e] * lam[:, e, None, None] for e in range(lam.shape[1])))
 
 

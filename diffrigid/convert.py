@@ -1,6 +1,6 @@
 """Convert what users write to arrays of one type: NumPy where values are known, and then checked, else traced.
 
-Every function takes the name of the argument first, for its messages. Known values stay NumPy, because under
+Functions that check take the name of the argument first, for their messages. Known values stay NumPy, because under
 `jit` even a constant is traced as soon as JAX holds it.
 """
 

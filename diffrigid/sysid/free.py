@@ -6,7 +6,7 @@ A kind of parameter is a frozen record with the verbs
     value(z, reference)       the parameter for z (k,); `reference` is its value at the start
     unbounded(reference)      the z whose value is the reference, pulled off its bounds
     draw(reference, random)   z of a random start
-    at_bound(value)           true if a result lies on a bound
+    at_bound(value)           true if a result lies on a bound of an interval
     log_volume(z, reference)  log |d value / d z|: volume of the parameter per volume of z
     check(where, value)       raises ValueError for a start that the kind does not allow
     scale(reference)          (k,) a large change of z: the measure of how well the data determine it
@@ -69,6 +69,7 @@ class Free:
         return self.unbounded(value) + self.spread * self.scale(value) * random.standard_normal(value.size)
 
     def log_volume(self, z: Array, reference: Any = None) -> Array:
+        del reference
         if np.isfinite(self.high):
             return (jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)).sum()
         return jnp.zeros((), z.dtype) if np.isinf(self.low) else z.sum()

@@ -196,6 +196,7 @@ def _side_by_side(parts: Sequence[tuple[Plan, tuple[int, ...]]], loss: Any, a: i
 
     @both.def_vmap
     def in_lanes(size: int, batched: Any, z: Array, data: tuple[Data, ...]) -> Any:
+        del size, batched
         cost, slope = lanes(z.T, data)
         return (cost, slope.T), (True, True)
 
