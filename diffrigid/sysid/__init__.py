@@ -19,7 +19,7 @@ from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
 from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
 from diffrigid.sysid.figures import correlation_figure, cost_figure, profile_figure, residual_figure
 from diffrigid.sysid.fit import fit
-from diffrigid.sysid.free import Free, each, interval, positive, prior, real
+from diffrigid.sysid.free import each, interval, positive, prior, real
 from diffrigid.sysid.gradient import first_order, lbfgs
 from diffrigid.sysid.losses import huber, squares, student
 from diffrigid.sysid.profile import profile, with_profiles
@@ -34,7 +34,6 @@ from diffrigid.sysid.summary import Parameter, load_fit
 __all__ = [
     "Channel",
     "Fit",
-    "Free",
     "Homography",
     "Marker",
     "Parameter",
