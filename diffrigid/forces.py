@@ -149,6 +149,7 @@ class Force:
 
     @property
     def twists(self) -> bool:
+        """True for a force at a point, which may have an arm."""
         return self.point is not None
 
     def __call__(self, bodies: Bodies, state: State, controls: Any) -> Wrench:

@@ -50,6 +50,12 @@ class Chart:
 def direction(spread: float = 0.5) -> Chart:
     """A vector of which only the direction varies, by an angle in 2D and by two in 3D: {"gravity": direction()}.
 
+    Args:
+        spread: [rad] standard deviation of the angles by which random starts are turned.
+
+    Raises:
+        ValueError: spread is not a number from 0 on.
+
     Example:
         >>> down = dr.direction().value(jnp.array([0.3]), jnp.array([0.0, -9.81]))  # turned by 0.3 rad
         >>> round(float(jnp.hypot(*down)), 6)
@@ -62,6 +68,12 @@ def direction(spread: float = 0.5) -> Chart:
 def rotation(spread: float = 0.5) -> Chart:
     """An orientation, turned by exp(z) in world axes, one angle in 2D and three in 3D: {"die.q": rotation()}.
 
+    Args:
+        spread: [rad] standard deviation of each of the angles by which random starts are turned.
+
+    Raises:
+        ValueError: spread is not a number from 0 on.
+
     Example:
         >>> dr.rotation().value(jnp.array([np.pi / 2]), jnp.array([1.0, 0.0])).round(6).tolist()
         [0.0, 1.0]
@@ -71,11 +83,16 @@ def rotation(spread: float = 0.5) -> Chart:
 
 
 def inertia(spread: float = 0.3, *, principal: bool = False) -> Chart:
-    """A (3, 3) inertia that remains that of a mass distribution: {"die.inertia": inertia()}.
+    """A (3, 3) inertia that remains that of a mass distribution, one with thickness: {"die.inertia": inertia()}.
 
     Args:
+        spread: [-] standard deviation of the logarithms by which random starts are scaled along each axis, and of the
+            shears between them.
         principal: True: the principal axes stay as they are, as those of a body with planes of symmetry; three numbers
-            instead of six.
+            instead of six, and no thickness is needed.
+
+    Raises:
+        ValueError: spread is not a number from 0 on; principal is not a bool.
 
     Example:
         >>> flat = dr.inertia(principal=True).value(jnp.array([-50.0, 0.0, 0.0]), jnp.eye(3))
@@ -91,7 +108,13 @@ def inertia(spread: float = 0.3, *, principal: bool = False) -> Chart:
 
 
 def shares(spread: float = 0.5) -> Chart:
-    """Ratios of several numbers: {("cue.mass", "ball.mass"): shares()} keeps the sum of both.
+    """Ratios of several numbers above zero: {("cue.mass", "ball.mass"): shares()} keeps the sum of both.
+
+    Args:
+        spread: [-] standard deviation of the logarithms of the ratios to the first, of random starts.
+
+    Raises:
+        ValueError: spread is not a number from 0 on.
 
     Example:
         >>> masses = dr.shares().value(jnp.array([np.log(3.0)]), jnp.array([1.0, 1.0]))  # impacts tell the ratio only

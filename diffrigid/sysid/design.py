@@ -118,6 +118,9 @@ def best_launch(
     Args:
         vary: what can be chosen of the initial state, as `free`: {"ball.v": interval(-3, 3)}.
         target: the one of `free` to learn, while the others are unknown too; default all of them (D-optimal).
+        starts: the first is the launch of `state`, the others are random.
+        steps: along the gradient, of each start.
+        seed: of the random starts.
 
     The gradient of the information is by central differences of exact Jacobians, all launches in one batch.
 

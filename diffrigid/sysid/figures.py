@@ -21,7 +21,11 @@ def _axes(width: float = 6.0, height: float = 3.5) -> tuple[Any, Any]:
 
 
 def residual_figure(fit: Fit, record: int = 0) -> Any:
-    """Residuals of a record over time, in standard deviations."""
+    """Residuals of a record over time, in standard deviations.
+
+    Raises:
+        ValueError: a loaded fit; there is no such record.
+    """
     checked_fit(fit, "residual_figure")
     figure, axes = _axes()
     for series in fit.problem.runs[checked_record(fit, record)].series:
@@ -51,7 +55,11 @@ def cost_figure(fit: Fit) -> Any:
 
 
 def correlation_figure(fit: Fit) -> Any:
-    """Correlations of the shared numbers."""
+    """Correlations of the shared numbers.
+
+    Raises:
+        ValueError: a loaded fit.
+    """
     checked_fit(fit, "correlation_figure")
     figure, axes = _axes(5.0, 4.2)
     names = number_names(fit.problem)

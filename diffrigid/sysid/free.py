@@ -104,7 +104,10 @@ class Prior:
 
 
 def interval(low: float, high: float) -> Free:
-    """A parameter between two bounds.
+    """A parameter between two bounds, in its unit; random starts are anywhere between.
+
+    Raises:
+        ValueError: bounds that are not finite numbers, or not low < high.
 
     Example:
         >>> dr.interval(0, 2).value(np.array([-50.0, 0.0, 50.0])).round(3)  # of what is fitted, which has no bounds
@@ -119,6 +122,9 @@ def interval(low: float, high: float) -> Free:
 def positive(spread: float = 0.5) -> Free:
     """A parameter > 0; random starts are a factor exp(spread N(0, 1)) away.
 
+    Raises:
+        ValueError: spread is not a number from 0 on.
+
     Example:
         >>> dr.positive().value(np.array([-50.0, 0.0, 1.0])).round(3)  # exp of what is fitted
         array([0.   , 1.   , 2.718])
@@ -128,6 +134,9 @@ def positive(spread: float = 0.5) -> Free:
 
 def real(spread: float = 0.5) -> Free:
     """Any number; random starts are spread * max(rms, 1) N(0, 1) away.
+
+    Raises:
+        ValueError: spread is not a number from 0 on.
 
     Example:
         >>> dr.real(spread=0.1).draw(np.array([3.0, 4.0]), np.random.default_rng(0)).round(2)  # a random start
@@ -149,6 +158,13 @@ def each(kind: Any) -> Each:
 
 def prior(kind: Any, mean: Any, deviation: Any) -> Prior:
     """A Gaussian prior beside the data: {"ball.mass": prior(positive(), 1.2, 0.1)}.
+
+    Args:
+        mean: a number, or those of a vector, in the unit of the parameter.
+        deviation: its standard deviation, likewise; one number stands for all.
+
+    Raises:
+        ValueError: not numbers, deviations that are not above 0, or more than one and not as many as the means.
 
     Example:
         >>> dr.prior(dr.positive(), 1.2, 0.1).mean, dr.prior(dr.real(), (0.0, 1.0), 0.1).deviation

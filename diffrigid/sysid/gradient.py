@@ -29,6 +29,9 @@ def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Ca
     """Steps of an optimiser of optax on all starts at once: first_order(optax.adam(1e-2)).
 
     The number of steps is `iterations` of `fit`, or else `steps`.
+
+    Raises:
+        ValueError: steps < 1.
     """
     at_least_one("steps", steps)
 
@@ -53,6 +56,12 @@ def lbfgs(steps: int = 200, memory: int = 10) -> Callable:
     """L-BFGS of optax, each start on its own, with steps halved until they gain (Armijo).
 
     The number of steps is at most `iterations` of `fit`, or else `steps`.
+
+    Args:
+        memory: earlier steps and gradients, of each start, from which the curvature is taken.
+
+    Raises:
+        ValueError: steps or memory < 1.
     """
     at_least_one("steps", steps)
     scale = optax.scale_by_lbfgs(memory_size=at_least_one("memory", memory))

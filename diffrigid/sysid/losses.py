@@ -59,6 +59,9 @@ def squares() -> Squares:
 def huber(at: float = 1.345) -> Huber:
     """Loss quadratic up to `at` standard deviations, linear beyond; 1.345 has 95 % efficiency in normal noise.
 
+    Raises:
+        ValueError: at is not a number above 0.
+
     Example:
         >>> dr.huber().rho(jnp.array([1.0, 10.0])).round(3).tolist()  # squares: 0.5, 50
         [0.5, 12.545]
@@ -68,6 +71,9 @@ def huber(at: float = 1.345) -> Huber:
 
 def student(nu: float = 4.0) -> Student:
     """Loss for heavy tails: noise of Student's distribution with nu degrees of freedom.
+
+    Raises:
+        ValueError: nu is not a number above 0.
 
     Example:
         >>> dr.student(nu=4.0).rho(jnp.array([1.0, 10.0])).round(3).tolist()  # squares: 0.5, 50

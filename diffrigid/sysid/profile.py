@@ -63,6 +63,9 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
     Args:
         points: an odd number of values, the fitted one in the middle; more follow where the interval is wide.
 
+    Raises:
+        ValueError: a loaded fit; no such shared number, or a vector; points that are even, or fewer than 3.
+
     Example:
         >>> curve = dr.profile(found, "restitution")
         >>> bool(curve.low < 0.8 < curve.high), curve.open  # open: where the data give no limit
@@ -86,7 +89,11 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
 
 
 def with_profiles(fit: Fit, profiles: Sequence[ProfileLikelihood]) -> Fit:
-    """The fit with the intervals of profiles in its table, and a note on those that are open."""
+    """The fit with the intervals of profiles in its table, and a note on those that are open.
+
+    Raises:
+        ValueError: a loaded fit.
+    """
     checked_fit(fit, "with_profiles")
     found = {p.name: p for p in profiles}
 

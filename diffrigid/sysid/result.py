@@ -58,14 +58,17 @@ class Fit:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
+        """What was fitted, with 95 % intervals; what all records share first, then what each has of its own."""
         return self.summary.parameters
 
     @property
     def noise(self) -> dict[str, float]:
+        """Standard deviation of the noise of each column, in its unit, estimated or the median of the given one."""
         return self.summary.noise
 
     @property
     def costs(self) -> np.ndarray:
+        """Loss of all residuals [-] at the end of every start, (starts,), lowest first; inf where it diverged."""
         return self.summary.costs
 
     @property
@@ -90,6 +93,7 @@ class Fit:
 
     @property
     def agree(self) -> int:
+        """Number of starts that ended at the lowest cost, or near it."""
         return self.summary.agree
 
     @property
@@ -99,6 +103,7 @@ class Fit:
 
     @property
     def notes(self) -> tuple[str, ...]:
+        """What the data cannot tell, and why not to believe the intervals; the lines with "!" under the table."""
         return self.summary.notes
 
     @property
@@ -210,6 +215,9 @@ class Fit:
         Args:
             fn: of the world and the initial state, in operations of JAX.
             record: whose scene it is, where records have numbers of their own.
+
+        Raises:
+            ValueError: there is no such record.
 
         Example:
             >>> lost = found.derived(lambda world, state: 1.0 - dr.paths.read(world, state, "restitution") ** 2)

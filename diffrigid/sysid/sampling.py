@@ -68,11 +68,17 @@ def sample(fit: Fit, draws: int = 1000, *, chains: int = 4, warmup: int = 300, s
     and seldom find another.
 
     Args:
-        draws: of each chain, after `warmup` more that tune the length of the steps.
+        draws: four or more of each chain, after `warmup`.
         chains: two or more, which are compared.
+        warmup: draws of each chain before, which tune the length of the steps.
+        seed: of the chains' starts and of the draws.
 
     Returns:
         `.draws`, or by [name], (chains, draws, ...); `.parameters`, as those of the fit; `.r_hat`, `.size`, `.notes`.
+
+    Raises:
+        ValueError: a loaded fit; too few draws, chains or warmup.
+        ImportError: blackjax is missing.
 
     Example:
         >>> posterior = dr.sample(found, draws=100, chains=2, warmup=100)

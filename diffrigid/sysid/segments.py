@@ -42,8 +42,11 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
 
     Positions, angles and orientations that are measured, and their velocities; the others are those of `state`.
 
+    Args:
+        observations: as of `fit`, one record, whose columns are named for what they observe.
+
     Raises:
-        ValueError: columns that `fit` does not take; a piece with fewer than two rows of a column.
+        ValueError: columns that `fit` does not take; count < 1, or a piece with fewer than two rows of a column.
 
     Example:
         >>> [piece.start for piece in dr.segments(world, state, measured, 3)]
@@ -113,6 +116,9 @@ def jumps(fit: Fit) -> dict[str, np.ndarray]:
     Returns:
         By "ball.x" [m], "ball.v" [m/s], "ball.w" [rad/s], (pieces - 1, D or A) in world axes; and by "ball.angle" or
         "ball.q" [rad], as a rotation vector in axes of the body.
+
+    Raises:
+        ValueError: a loaded fit.
     """
     checked_fit(fit, "jumps")
     so, records = rotations(fit.world.dim), list(zip(fit.problem.runs, fit.scenes, strict=True))

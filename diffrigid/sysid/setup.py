@@ -90,6 +90,9 @@ def make_problem(
     Args:
         begin: a record without a state of its own begins as its first rows show it, in what is free by `each`.
         places: for each record, the record of `resume` whose own numbers it takes; None: none. Default in order.
+
+    Raises:
+        ValueError: what `fit` does not take.
     """
     found = runs(world, state, observations, observe or {}, noise)
     pairs = [floats(run.world, run.state) for run in found]
@@ -284,6 +287,9 @@ def residual_vector(problem: Problem, z: np.ndarray) -> np.ndarray:
     """Residuals in standard deviations, (m,); 0 where a value is missing. NumPy: `jacobian_matrix` is its derivative.
 
     Where no noise was given, in those of a guess from the scatter of the column.
+
+    Raises:
+        ValueError: z is not of the shape of `start_vector`.
     """
     numbers = unpack(problem, z)
     parts = [evaluate(g.plan, numbers.of(g.members), g.data)[..., 0].T.ravel() for g in problem.groups]
@@ -291,7 +297,11 @@ def residual_vector(problem: Problem, z: np.ndarray) -> np.ndarray:
 
 
 def jacobian_matrix(problem: Problem, z: np.ndarray) -> np.ndarray:
-    """Derivatives of `residual_vector`, (m, a + R b)."""
+    """Derivatives of `residual_vector`, (m, a + R b).
+
+    Raises:
+        ValueError: z is not of the shape of `start_vector`.
+    """
     numbers, (a, b) = unpack(problem, z), problem.sizes
     blocks = []
     for group in problem.groups:

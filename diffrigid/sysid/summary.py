@@ -22,10 +22,10 @@ class Parameter:
     """One fitted number or vector; with `records` > 0 those of each record, along a first axis."""
 
     name: str
-    value: np.ndarray
-    low: np.ndarray  # 95 % interval
+    value: np.ndarray  # in `unit`
+    low: np.ndarray  # 95 % interval, likewise
     high: np.ndarray
-    unit: str
+    unit: str  # SI, or that of a column; "" where it has none or is unknown
     note: str  # "" or why not to trust it
     records: int = 0
 
@@ -39,12 +39,12 @@ class Summary:
 
     parameters: tuple[Parameter, ...]
     noise: dict[str, float]  # standard deviation of each column's residuals, in its unit
-    costs: np.ndarray  # (starts,) the loss of the residuals, lowest first; inf: diverged
+    costs: np.ndarray  # (starts,) [-] the loss of the residuals, lowest first; inf: diverged
     agree: int  # starts that ended at the best cost
     orders: Orders  # pairs that strike, in order of time, for each of the best 64 starts and of the first three records
     notes: tuple[str, ...]  # what the data cannot tell, and why not to believe the intervals
-    seed: int
-    seconds: float
+    seed: int  # of the random starts
+    seconds: float  # [s] that the fit took
     versions: dict[str, str]
 
     def __getitem__(self, name: str) -> Parameter:
@@ -96,6 +96,10 @@ def _plain(data: Any) -> Any:
 
 def load_fit(path: str | Path) -> Summary:
     """Load what `save` wrote: the table, from which `fit(..., resume=...)` continues.
+
+    Raises:
+        ValueError: the file is not a saved fit.
+        OSError: there is no such file.
 
     Example:
         >>> saved = dr.load_fit(found.save("fit.json"))  # the table; a fit goes on from it by resume=saved
