@@ -1,6 +1,6 @@
 """Which tool finds restitution, a mass and a velocity from noisy positions of three colliding discs, and at what cost?
 
-    python experiments/sysid_vs_peers.py [--runs 40] [--cases NAME,...] [--out FILE]
+    python experiments/sysid_vs_peers.py [--runs 40] [--cases "NAME;..."] [--out FILE]
 
 Free: restitution, the mass of the middle disc, v of the first; given: positions of all at 60 Hz over 2 s, in closed
 form, with normal noise of 3 mm. Each record, with noise of its own, is fitted from one random start of its own.
