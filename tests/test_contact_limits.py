@@ -406,3 +406,39 @@ def test_in_single_precision_too_one_corner_strikes_after_the_other():
     assert abs(exact.w[-1, 0, 0]) > 0.5  # at once they would not turn it
     assert_allclose(rounded.w[-1], exact.w[-1], atol=1e-3)
     assert_allclose(rounded.v[-1], exact.v[-1], atol=1e-3)
+
+
+def test_two_capsules_roll_over_each_other_without_falling_into_each_other():
+    """Their sides come to rest on one another within the step, then close as fast as they turn: slopes, and the gap."""
+    poses = {
+        "a": ((0.0654, -0.0064, -0.0184), (-0.7173, 0.6060, -0.3286, -0.1011)),
+        "b": ((0.1493, 0.1641, 0.2646), (-0.5521, -0.2545, 0.6558, 0.4475)),
+    }
+    moves = {
+        "a": ((1.038, -0.1727, -0.5138), (-0.4698, 0.7554, 0.3224)),
+        "b": ((-0.1294, 0.4461, 0.7320), (-2.2192, -6.7351, -2.1631)),
+    }
+    capsule = dr.Capsule(radius=0.15, half_length=0.3)
+    bodies = {
+        name: dr.Body(capsule, mass=1.5, inertia=(0.055, 0.058, 0.067), x=x, q=q / np.linalg.norm(q), v=v, w=w)
+        for (name, (x, q)), (v, w) in zip(poses.items(), moves.values(), strict=True)
+    }
+    world, state = dr.scene(bodies, restitution=0.3)
+    apart = dr.gap(world, state, "a", "b") - 1.8e-5
+    line = jax.grad(lambda state: dr.gap(world, state, "a", "b"))(state).x[0]  # along it they nearly touch
+    state = dr.replace(state, x=state.x.at[0].add(-apart * line))
+    along = jnp.array([[1.0, 0.5, -0.3], [0.0, 0.0, 0.0]])
+
+    @jax.jit
+    def moved(h):
+        def end(h):
+            after = dr.step(world, dr.replace(state, v=state.v + h * along), 0.7 / 60)
+            return jnp.concatenate([after.v, after.w]), dr.gap(world, after, "a", "b")
+
+        (motion, gap), (slope, _) = jax.jvp(end, (h,), (1.0,))
+        return motion, slope, gap
+
+    ahead, behind = moved(1e-5)[0], moved(-1e-5)[0]
+    _, slope, gap = moved(0.0)
+    assert_allclose(slope, (ahead - behind) / 2e-5, atol=1e-6)
+    assert abs(gap) < 1e-4

@@ -89,14 +89,15 @@ def taking_over(task: Task, gaps: Gaps, rests: Array) -> Array:
     return rests | (touches(gap, v, gaps.acceleration, near, slow) & is_supported(task.a, task.b)[None])
 
 
-def falling(task: Task, gaps: Gaps, rests: Array) -> Array:
-    """`rests` (K, *batch) without contacts that close faster than they can have fallen since the start.
+def falling(task: Task, gaps: Gaps, rests: Array, s: Array) -> Array:
+    """`rests` (K, *batch) without contacts that close at time s faster than they can have fallen since the start.
 
     Crossings of edges are listed by their gaps: of those that touch, one that strikes may take the place of one that
-    rested.
+    rested. What has fallen as fast as that is as deep inside.
     """
     least = task.slow[None] + 2.0 * jnp.abs(gaps.acceleration) * jnp.maximum(task.span, 0.0)[None]
-    return rests & (gaps.rate >= -least)
+    deep = gaps.gap <= 0.25 * gaps.rate * jnp.maximum(s - task.start, 0.0)[None]
+    return rests & ((gaps.rate >= -least) | deep)
 
 
 def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:

@@ -191,7 +191,7 @@ def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
 
     def follow(now: Search, gaps: Gaps) -> Search:
         rests = taking_over(task, gaps, jnp.where(now.count == 0, resting(task, gaps), now.rests))
-        now, rests = now._replace(count=now.count + 1, rests=rests), falling(task, gaps, rests)
+        now, rests = now._replace(count=now.count + 1, rests=rests), falling(task, gaps, rests, now.s)
         now = choose(now.stage == ADVANCING, _advanced(task, now, clear(gaps, rests, now.s)), now)
         following = choose(now.stage == POLISHING, _polished(task, now, gaps, rests), now)
         if task.width is None:
