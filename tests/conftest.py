@@ -19,7 +19,18 @@ jax.config.update("jax_traceback_in_locations_limit", 0)  # XLA carries along wh
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
+LONG = (
+    "batch", "closed_form", "contact_limits", "crowd", "docstrings", "fit", "friction", "height_field", "isolated",
+    "joint_motion", "joints", "laws", "linkage", "main", "piles", "profile", "program", "readme", "rolling", "smooth",
+    "stops", "sysid_recover", "transformations",
+)  # fmt: skip
+
 gc.disable()  # else a third of the time of tracing goes into looking for garbage in what tracing holds
+
+
+def pytest_collection_modifyitems(items):
+    """Files that take long first, so that the workers end together."""
+    items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONG)
 
 
 @pytest.fixture(scope="module", autouse=True)

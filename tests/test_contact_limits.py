@@ -106,7 +106,11 @@ def test_a_rod_that_a_torque_spins_up_does_not_pass_a_peg(width):
     assert 17.0 < once < 18.0  # 20 without the peg
 
 
-@pytest.mark.parametrize("shape", [dr.Box(half=(0.01, 0.006)), dr.Capsule(radius=0.004, half_length=0.01)], ids=type)
+@pytest.mark.parametrize(
+    "shape",
+    [pytest.param(dr.Box(half=(0.01, 0.006)), marks=pytest.mark.slow), dr.Capsule(radius=0.004, half_length=0.01)],
+    ids=type,
+)
 def test_what_is_small_and_fast_does_not_tunnel_in_single_precision(shape):
     """Thrown at a thin slab, one after the other: together in a batch each would search as long as the slowest."""
     rng, dt, speed = np.random.default_rng(3), 1 / 60, 9.0

@@ -124,6 +124,7 @@ def test_energy_never_rises(dim):
     assert rise.max() < (PUSHED if dim == 2 else SPIN_SERIES)
 
 
+@pytest.mark.slow
 def test_energy_rises_less_in_smaller_steps():
     """Where bodies stay together, an eighth of the step leaves less than 1 / 300 of what may come of the even force."""
     slow = jax.tree.map(lambda leaf: leaf[LIVELY:WORLDS], starts(2))

@@ -105,7 +105,7 @@ def box_and_plane(e, y, vy, g):
     return dr.scene(bodies, gravity=jnp.stack([0.0, -g]), restitution=e)
 
 
-@pytest.mark.parametrize("make", [disc_and_plane, box_and_plane])
+@pytest.mark.parametrize("make", [disc_and_plane, pytest.param(box_and_plane, marks=pytest.mark.slow)])
 def test_what_turns_back_before_the_plane_feels_it(make):
     """Thrown at a plane from which gravity pulls away, it comes within 2 cm; a speed too low by that misses."""
     miss = dict(e=1.0, y=1.12, vy=-2.0, g=-2.0)  # gap_min = 1.02 - vy^2 / 2 g = 0.02 m; turns after 1 s

@@ -108,6 +108,7 @@ def test_damping_is_exponential():
     )
 
 
+@pytest.mark.slow
 def test_damping_slows_what_friction_leaves():
     """A slider with both, v = (v0 + F / c) exp(-c t / m) - F / c: the damping acts on what friction has done so far."""
     t, F = 0.5, 2.0
