@@ -412,6 +412,7 @@ def test_in_single_precision_too_one_corner_strikes_after_the_other():
     assert_allclose(rounded.v[-1], exact.v[-1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_two_capsules_roll_over_each_other_without_falling_into_each_other():
     """Their sides come to rest on one another within the step, then close as fast as they turn: slopes, and the gap."""
     poses = {

@@ -121,6 +121,7 @@ def test_block_on_a_slope_in_space():
     assert_allclose(slopes, true_slopes, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_box_that_spins_flat_on_a_floor():
     """Its corners, at a distance r and with a quarter of the weight each, brake it by mu m g r: until it stops."""
     half, times = (0.3, 0.2, 0.1), (0.2, 0.5)  # it moves, and stands still
@@ -371,6 +372,7 @@ def on_a_rod_in_closed_form(start, om, u):
     return jnp.stack([along * cos - HIGH * sin, along * sin + HIGH * cos])
 
 
+@pytest.mark.slow
 def test_a_side_that_turns_presses_without_any_force():
     """The Coriolis force holds them together: of second order in the step, slopes too."""
     p = tuple(map(jnp.asarray, (-0.3, 6.0, 3.0)))

@@ -171,6 +171,7 @@ def bounced(slope, base, x, v, e, t):
     return x + s * v + 0.5 * s**2 * down + after * (t - s) + 0.5 * (t - s) ** 2 * down
 
 
+@pytest.mark.slow
 def test_a_ball_bounces_off_a_tilted_plane():
     """Place and its slopes by the plane, the start, the restitution and the time, in closed form."""
     slope, base, x, v = vector(0.3, -0.2), jnp.asarray(0.4), vector(1.1, 1.8, 1.4), vector(0.4, -0.3, 0.2)

@@ -199,6 +199,7 @@ def test_slopes_of_a_thrown_arm_are_those_of_differences():
     assert_allclose(slopes[:4], (ends[4:8] - ends[8:]) / (2 * h), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_joint_of_others_changes_nothing():
     """A box that strikes the floor with a corner, and slides there, does the same beside two bodies with a joint."""
     q = jnp.array([0.95, 0.2, 0.15, 0.1])
@@ -241,6 +242,7 @@ def test_an_arm_falls_on_the_floor_and_rests():
     assert float(jnp.abs(states.v[-1]).max()) < 1e-9
 
 
+@pytest.mark.slow
 def test_repeated_joints_are_harmless():
     """Two hinges between the same two bodies, and a third: more equations than freedoms."""
     body = {"mass": 1.0, "inertia": 0.2}

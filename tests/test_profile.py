@@ -145,6 +145,7 @@ def test_what_slips_over_vertices_in_line_slips_as_on_a_plane(shape):
     assert_allclose(slopes, true_slopes, atol=EXACT)
 
 
+@pytest.mark.slow
 def test_a_slope_that_begins_beside_a_body_is_not_felt():
     """Thrown boxes that come down, slip and tip on a level face beside one that rises by 0.001."""
     flat = np.array([(-3.0, 0.0), (0.0, 0.0), (3.0, 0.0)])

@@ -142,6 +142,7 @@ def test_a_hinge_in_space_stops_as_in_the_plane():
     assert_allclose(space[2], flat[2][0] * axis, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_pendulum_rests_on_its_stop():
     """After rebounds; and its stop is at the same place with an arm that hangs on it by a second joint."""
 
@@ -275,6 +276,7 @@ def test_friction_of_a_slider_keeps_the_spin_of_its_rod():
     assert_allclose(spin, (inertia + mass * 0.09) * 3.0, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_friction_turns_back_with_the_motion():
     """A slider on a spring, with dry friction: each half of a swing is one of cosine about F / k, and loses 2 F / k."""
     t, rate = 1.4, 240
