@@ -20,6 +20,7 @@ from diffrigid.shapes import HeightField
 from diffrigid.state import rotations
 
 WANDER = 1.1  # [-] growth allowed to the angular speed of a free body in 3D within a step
+FALLEN = 0.25  # [-] least depth over rate and time of what fell from rest, by an acceleration that grows as t^2
 TOUCH_ROUNDING = 1e5  # [-] times eps times the near distance: gap that rounding may leave at touching bodies
 
 
@@ -96,7 +97,7 @@ def falling(task: Task, gaps: Gaps, rests: Array, s: Array) -> Array:
     rested. What has fallen as fast as that is as deep inside.
     """
     least = task.slow[None] + 2.0 * jnp.abs(gaps.acceleration) * jnp.maximum(task.span, 0.0)[None]
-    deep = gaps.gap <= 0.25 * gaps.rate * jnp.maximum(s - task.start, 0.0)[None]
+    deep = gaps.gap <= FALLEN * gaps.rate * jnp.maximum(s - task.start, 0.0)[None]
     return rests & ((gaps.rate >= -least) | deep)
 
 
