@@ -53,6 +53,8 @@ def test_a_rollout_is_one_function_and_the_same():
     assert not done.returncode, done.stderr
     found, expected = json.loads(done.stdout), bounces()
     assert found["loops"] == 0
+    if jax.__version_info__ < (0, 12):  # from then on XLA makes one function of a loop by itself
+        assert expected["loops"] == 1
     assert_allclose(found["x"], expected["x"], rtol=1e-9)
 
 

@@ -315,7 +315,13 @@ def jacobian_matrix(problem: Problem, z: np.ndarray) -> np.ndarray:
 
 
 def values_at(problem: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
-    """Values of the parameters at z (a + R b,), by name; those of each record stacked, NaN where it has no such."""
+    """Values of the parameters at z (a + R b,), by name, in SI units or those of a column, shaped as in the scene.
+
+    Those of each record are stacked, (R, ...), NaN where it has no such. NumPy, not differentiable.
+
+    Raises:
+        ValueError: z is not of the shape of `start_vector`.
+    """
     at, scenes = unpack(problem, z), [scene_of(run) for run in problem.runs]
 
     def value(slot: Slot, z: Array, scene: Scene) -> np.ndarray:
