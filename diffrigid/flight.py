@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid import so3
-from diffrigid.forces import is_constant, total_wrench
+from diffrigid.forces import is_constant, total_wrench, within
 from diffrigid.linkage import joint_wrench
 from diffrigid.numerics import safe_divide
 from diffrigid.pytree import array, pytree, replace, static
@@ -76,8 +76,7 @@ def launch(world: "World", state: State, controls: Any, t0: Array, t1: Array) ->
 
 def _wrench(world: "World", state: State, controls: Any, span: Array) -> Wrench:
     """All forces on free bodies, and those of the joints, for an integration over span (*batch) [s]."""
-    forces = tuple(force.within(span) if hasattr(force, "within") else force for force in world.forces)
-    wrench = total_wrench(forces, world.bodies, state, controls)
+    wrench = total_wrench(within(world.forces, span), world.bodies, state, controls)
     return joint_wrench(world.joints, world.statics, world.bodies, state, wrench, span) if world.joints else wrench
 
 

@@ -247,6 +247,11 @@ def is_uniform(forces: tuple) -> bool:
     return all(getattr(force, "uniform", False) for force in forces)
 
 
+def within(forces: tuple, span: Array) -> tuple:
+    """The forces for a step of length span (*batch) [s]."""
+    return tuple(force.within(span) if hasattr(force, "within") else force for force in forces)
+
+
 def total_wrench(forces: tuple, bodies: Bodies, state: State, controls: Any) -> Wrench:
     """Sum of all wrenches; the torque is None when no force has one."""
     F, tau = jnp.zeros_like(state.v), None

@@ -4,11 +4,10 @@ A trajectory stores states, not impulses, so they are inferred, one interval bet
 
     who touches    shapes that come together on their free flight from the start of the interval, or lie together
                    through it; corner against side or face, and in 3D edge against edge, of the cores
-    impulses       the smallest that, at these points and in the joints, explain the changes of momentum and angular
-                   momentum beyond what the forces do in the interval (least norm: where points share a load, equally)
+    impulses       the smallest that, at these points and in the joints, explain the changes of momentum, see `impulses`
 
 Contacts with a `Profile` or a `HeightField` are not found, and their effect is attributed to other contacts of the same
-bodies. Nor are contacts within a crowd, which lists no pairs. Exact for a body with one contact.
+bodies. Nor are contacts within a crowd, which lists no pairs.
 """
 
 import functools
@@ -16,16 +15,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import Array
 
-from diffrigid.elimination import islands
-from diffrigid.forces import total_wrench
 from diffrigid.hull import hull_faces
+from diffrigid.impulses import Changes, changes_of, impulses_at
 from diffrigid.pytree import replace
 from diffrigid.shapes import UNEVEN, Box, HalfSpace, Hull, edges, radius, vertices
-from diffrigid.state import Bodies, State, Wrench, momentum, spin
 from diffrigid.tables import lined_up
-from diffrigid.touch import Convex, gaps, rotated
+from diffrigid.touch import Convex, gaps
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.world import World
 
@@ -33,10 +29,8 @@ SHOWN = 30  # impacts that are printed
 SLOP = 2e-3  # [-] of the smaller size: gap up to which bodies touch
 TOGETHER = 1e-2  # [-] of it: gap up to which other points take part in an impact
 STRUCK = 1e-5  # [-] of the impulse of the forces: a smaller change of momentum is none
-BEYOND, FASTER = (
-    1.1,
-    1.5,
-)  # [-] times the sizes, and the path at the first speed: others do not meet
+BEYOND = 1.1  # [-] times the sizes,
+FASTER = 1.5  # [-] and times the path at the first speed: what is further apart does not meet
 TINY = 1e-9  # [m, N s] where there is no size, no force
 WORK = 4_000_000  # pairs times intervals beyond which not all stored times are examined
 ROUGH = 5.0  # [-] an impulse that exceeds that of the forces in an interval by this factor is an impact
@@ -121,18 +115,20 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     world, dim = trajectory.world, trajectory.world.dim
     names = world.names + world.static_names
     some = _thinned(trajectory)
-    motion, (dp, dL, push) = _motion(some), _changes(some)
+    motion, changes = _motion(some), changes_of(some)
     groups = [group for group in world.pairs if not isinstance(world.shapes[group.shape_b], UNEVEN)]
-    found = [_touches(world, group, motion, dp, dL, push) for group in groups]
+    found = [_touches(world, group, motion, changes) for group in groups]
     touch = Touch(*(np.concatenate(parts) for parts in zip(*found, strict=True))) if found else None
     if touch is None or not len(touch.s):
         none = np.zeros(0, int)
         return Meetings(np.zeros(0), none > 0, none, none, np.zeros((0, dim)), np.zeros((0, dim)), names)
-    impulse = _impulses(world, motion, touch, dp, dL)
+    k, ends = touch.interval, np.stack([touch.a, touch.b])
+    arms = touch.point - motion.x[k, ends] - touch.s[:, None] * motion.v[k, ends]
+    impulse = impulses_at(changes, k, ends, arms)
     impulse = np.where(touch.a[:, None] < len(world.names), impulse, -impulse)
-    size, ends = np.linalg.norm(impulse, axis=1), np.stack([touch.a, touch.b], axis=1)
+    size, push = np.linalg.norm(impulse, axis=1), changes.push
     moved = np.concatenate([push, np.zeros((len(push), len(world.static_names)))], axis=1)
-    rough = size > ROUGH * moved[touch.interval[:, None], ends].max(1)
+    rough = size > ROUGH * moved[k, ends].max(0)
     impact = touch.new | rough
     drawn = np.ones(len(touch.s), bool)
     if times is not None:
@@ -177,40 +173,13 @@ def _motion(trajectory: Trajectory) -> Sampled:
     return Sampled(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0))
 
 
-def _changes(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """By interval and body: change of momentum (T, N, D) and of angular momentum (T, N, A) beyond that by the forces,
-    and the size of the impulse of the forces, (T, N), all [N s]."""
-    bodies, h = trajectory.world.bodies, np.diff(trajectory.t)[:, None, None]
-    state = jax.tree.map(lambda leaf: leaf.astype(bodies.mass.dtype), trajectory.state)
-    *both, wrench = _momenta(trajectory.world.forces, bodies, state, trajectory.controls)
-    p, L = (np.asarray(momenta, float) for momenta in both)
-
-    def added(force, like):
-        return np.zeros_like(like[1:]) if force is None else h * np.asarray(force, float)
-
-    F = added(wrench.F, p)
-    return np.diff(p, axis=0) - F, np.diff(L, axis=0) - added(wrench.tau, L), np.linalg.norm(F, axis=2)
-
-
-@jax.jit
-def _momenta(forces: tuple, bodies: Bodies, states: State, controls: Any) -> tuple[Array, Array, Wrench]:
-    """Momenta and angular momenta of states (T+1, ...), and the mean of the forces at both ends of each interval."""
-
-    def wrench(state, controls):
-        return total_wrench(forces, bodies, state, controls)
-
-    p, L = (jax.vmap(of, (None, 0))(bodies, states) for of in (momentum, spin))
-    ends = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], states) for rows in (slice(None, -1), slice(1, None))]
-    at_ends = [jax.vmap(wrench)(end, controls) for end in ends]
-    return p, L, jax.tree.map(lambda a, b: 0.5 * (a + b), *at_ends)
-
-
-def _touches(world: World, group: Any, motion: Sampled, dp: np.ndarray, dL: np.ndarray, push: np.ndarray) -> Touch:
+def _touches(world: World, group: Any, motion: Sampled, changes: Changes) -> Touch:
     """Contacts of all pairs of one kind."""
     sides = _side(world, group.shape_a), _side(world, group.shape_b)
     a, b, rows = np.array(group.a), np.array(group.b), (np.array(group.row_a), np.array(group.row_b))
     h, size = np.diff(motion.t), np.minimum(sides[0].size[rows[0]], sides[1].size[rows[1]])
-    struck = np.linalg.norm(dp, axis=2) + np.linalg.norm(dL, axis=2) / max(size.min(), TINY) > STRUCK * (push + TINY)
+    change = np.linalg.norm(changes.p, axis=2) + np.linalg.norm(changes.L, axis=2) / max(size.min(), TINY)
+    struck = change > STRUCK * (changes.push + TINY)
     struck = np.concatenate([struck, np.zeros((len(struck), len(world.static_names)), bool)], axis=1)
     apart = np.linalg.norm(motion.x[:-1, a] - motion.x[:-1, b], axis=2)
     path = h[:, None] * np.linalg.norm(motion.v[:-1, a] - motion.v[:-1, b], axis=2)
@@ -298,54 +267,3 @@ def _repeated(point: np.ndarray, near: np.ndarray, distance: np.ndarray) -> np.n
         apart = np.linalg.norm(places[:, None] - places[None], axis=2)
         repeated[row, chosen] = np.tril(apart < distance[row], -1).any(1)
     return repeated
-
-
-def _impulses(world: World, motion: Sampled, touch: Touch, dp: np.ndarray, dL: np.ndarray) -> np.ndarray:
-    """Impulses (M, D) [N s] on collider a (b receives the opposite), the least that explain the changes of momentum."""
-    found, moving = np.zeros_like(touch.point), len(world.names)
-    change, order = np.concatenate([dp, dL], axis=2), np.argsort(touch.interval, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(touch.interval[order])) + 1):
-        k, s = touch.interval[rows[0]], touch.s[rows]
-        ends = np.stack([touch.a[rows], touch.b[rows]])
-        arms = touch.point[rows] - motion.x[k][ends] - s[:, None] * motion.v[k][ends]
-        joints = [_anchors(world, motion, k, group) for group in world.joints]
-        all_ends, all_arms = (np.concatenate(parts, axis=1) for parts in zip((ends, arms), *joints, strict=True))
-        label = np.array([bodies[0] for bodies in islands(all_ends.T.tolist(), moving)])
-        island = label[all_ends.min(0)]  # statics have the larger numbers
-        for number in np.unique(island[: rows.size]):
-            bodies, chosen = np.flatnonzero(label == number), np.flatnonzero(island == number)
-            within = np.searchsorted(bodies, all_ends[:, chosen])
-            within = np.where(all_ends[:, chosen] < moving, within, len(bodies))
-            A = _columns(within, all_arms[:, chosen], len(bodies), motion.w.shape[2])
-            normal = A @ A.T
-            lam = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), change[k, bodies].ravel())
-            contacts = chosen[chosen < rows.size]
-            found[rows[contacts]] = (A.T @ lam).reshape(len(chosen), -1)[: len(contacts)]
-    return found
-
-
-def _columns(ends: np.ndarray, arms: np.ndarray, moving: int, A: int) -> np.ndarray:
-    """Momenta and angular momenta of all bodies, (N (D + A), C D), by unit impulses at C points on the bodies
-    ends (2, C), arms (2, C, D) from their centres: + on the first, - on the second."""
-    count, dim = arms.shape[1:]
-    made = np.zeros((moving, dim + A, count, dim))
-    for side, sign in ((0, 1.0), (1, -1.0)):
-        for c, body in enumerate(ends[side]):
-            if body < moving:
-                made[body, :dim, c] += sign * np.eye(dim)
-                made[body, dim:, c] += sign * _moments(arms[side, c])
-    return made.reshape(moving * (dim + A), count * dim)
-
-
-def _moments(r: np.ndarray) -> np.ndarray:
-    """Moments (A, D) of the unit impulses along the axes at r (D,)."""
-    return np.array([[-r[1], r[0]]]) if len(r) == 2 else np.cross(r, np.eye(3)).T
-
-
-def _anchors(world: World, motion: Sampled, k: int, group: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Bodies (2, J) of the joints of one kind, and arms (2, J, D) [m] from their centres to the anchors."""
-    a, anchor = np.array(group.a), np.asarray(group.anchor_a, float)
-    arm_a = rotated(motion.q[k, a], anchor)
-    b = np.array(group.b)
-    x = np.concatenate([motion.x[k], np.zeros((1, world.dim))])
-    return np.stack([a, b]), np.stack([arm_a, motion.x[k, a] + arm_a - x[b]])

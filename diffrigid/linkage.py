@@ -105,7 +105,7 @@ def to_sides(ends: tuple[tuple[int, int], ...], values: Array) -> Array:
     return rows(values, tuple(tuple(end if end < moving else -1 for end in pair) for pair in ends))
 
 
-def _by_body(ends: tuple[tuple[int, int], ...], moving: int, by_sides: Array) -> Array:
+def by_body(ends: tuple[tuple[int, int], ...], moving: int, by_sides: Array) -> Array:
     """Sum values for both bodies of every joint (n, 2, ...) over the joints of each moving body, (N, ...)."""
     return rows(by_sides.reshape(-1, *by_sides.shape[2:]), _sides_of(ends, moving)).sum(1)
 
@@ -127,7 +127,7 @@ def _rates(link: Linkage, twists: Array) -> Array:
 def _pull(link: Linkage, lam: Array) -> Array:
     """J^T lam on all bodies, (N, D + A, *batch)."""
     so = rotations(link.groups[0].a.x.shape[1])
-    return _by_body(link.ends, len(link.inverse_mass), joint_forces(so, link.sides, link.groups, lam))
+    return by_body(link.ends, len(link.inverse_mass), joint_forces(so, link.sides, link.groups, lam))
 
 
 def _moved(link: Linkage, forces: Array) -> Array:
@@ -226,7 +226,7 @@ def _damping(group: Any, at: PlacedJoints, link: Linkage, twists: Array, share: 
         return -(damping * (along * u).sum((0, 1)))[None, None] * along
 
     of_both = (to_sides(ends, leaf) for leaf in (twists, link.inverse_mass, link.inverse_inertia))
-    return _by_body(ends, len(twists), of_each(resisting, (at,), *of_both))
+    return by_body(ends, len(twists), of_each(resisting, (at,), *of_both))
 
 
 def _resolved(steps: Array) -> Array:

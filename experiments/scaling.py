@@ -6,10 +6,10 @@ Scene S2 of `throughput.py` (sixteen discs in a box), 2048 worlds, 60 steps, sin
 `rollout_batch` that is the same in all cases: on 1 device, on N devices of one process, on N processes of one device
 each (pinned to a core each, as launchers do); forward and gradient, median of five after a warm-up.
 
-2026-11-27, two of 16 cores of an Intel Xeon, jax 0.11.2, world-steps/s: one device 9.0e5 forward, two devices 1.66e6 (1.85
-times as many), two processes 1.67e6 (1.87 times); gradients 1.3e5, 2.8e5 and 4.4e5, more than twice as many, which the
-noise of that machine does not explain and a Zen 5 does not repeat: there 1024 worlds of one device have a gradient as
-fast as 2048. The cache (Zen 5): 29 CPU-seconds to the first result, then 7.
+2026-11-27, two of 16 cores of an Intel Xeon, jax 0.11.2, world-steps/s: one device 9.0e5 forward, two devices 1.66e6
+(1.85 times as many), two processes 1.67e6 (1.87 times); gradients 1.3e5, 2.8e5 and 4.4e5, more than twice as many, for
+no reason that is known: on a Zen 5 a gradient of 1024 worlds is as fast by world as one of 2048. The cache (Zen 5): 29
+CPU-seconds to the first result, then 7.
 """
 
 import argparse

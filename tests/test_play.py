@@ -131,6 +131,60 @@ def test_points_that_carry_a_body_carry_its_weight(dim, points):
     assert abs(moment) < 1e-6
 
 
+def pressed(bodies, joints, step=0.01, **scene):
+    """The contact of a motion that stays as it is at the start: its force on the first body [N]."""
+    world, state = dr.scene(bodies, joints=joints, **scene)
+    run = trajectory(world, [0.0, step], *(np.stack([leaf] * 2) for leaf in (state.x, state.q, state.v, state.w)))
+    found = dr.contacts(run)
+    assert len(found.t) == 1 and not found.impact.any()
+    return found.impulse[0] / step
+
+
+def held_rod(**joint):
+    """A rod of 1 m and 1 kg along x, on a hinge at the origin, and a peg that touches it at 0.9 m from below."""
+    rod = dr.Body(dr.Box(half=(0.5, 0.05)), mass=1.0, x=(0.5, 0.05))
+    peg = dr.Static(dr.Disc(radius=0.05), x=(0.9, -0.05))
+    return {"rod": rod, "peg": peg}, {"hinge": dr.Revolute("rod", anchor_a=(-0.5, -0.05), **joint)}
+
+
+def test_what_a_motor_presses_on_feels_its_torque():
+    """As of a force that does the same; one that reaches its speed, here 0, does not press."""
+    bodies, joints = held_rod(speed=-1.0, friction=1.8, damping=0.3)
+    np.testing.assert_allclose(pressed(bodies, joints), [0.0, 1.8 / 0.9], atol=1e-6)
+    bodies, joints = held_rod()
+    turn = {"turn": dr.Torque("rod", tau=-1.8)}
+    np.testing.assert_allclose(pressed(bodies, joints, forces=turn), [0.0, 1.8 / 0.9], atol=1e-6)
+    bodies, joints = held_rod(speed=0.0, friction=1e3)
+    weight = pressed(bodies, joints, gravity=(0.0, -G))[1]  # shared with the motor
+    assert 0 < weight < 0.5 * G / 0.9
+
+
+@pytest.mark.parametrize("limit", [{"lower": 0.0}, {"upper": 0.0}])
+def test_a_hinge_at_its_limit_carries_what_lies_on_its_arm(limit):
+    way = 1.0 if "lower" in limit else -1.0
+    rod = dr.Body(dr.Box(half=(0.5, 0.05)), mass=1.0, x=(0.5, 0.0))
+    ball = dr.Body(dr.Disc(radius=0.1), mass=0.5, x=(0.7, 0.15 * way))
+    joints = {"hinge": dr.Revolute("rod", anchor_a=(-0.5, 0.0), **limit)}
+    force = pressed({"rod": rod, "ball": ball}, joints, gravity=(0.0, -G * way))
+    np.testing.assert_allclose(force, [0.0, -0.5 * G * way], atol=1e-6)
+
+
+def test_a_door_lies_on_a_peg_with_its_moment_about_the_hinge():
+    """Besides the force at its anchor a hinge in space transmits what keeps its axis."""
+    door = dr.Body(dr.Box(half=(0.5, 0.1, 0.05)), mass=2.0, x=(0.5, 0.0, 0.05))
+    peg = dr.Static(dr.Sphere(radius=0.05), x=(0.9, 0.05, -0.05))
+    hinge = dr.Revolute("door", anchor_a=(-0.5, 0.0, -0.05), axis_a=(0.0, 1.0, 0.0))
+    force = pressed({"door": door, "peg": peg}, {"hinge": hinge}, gravity=(0.0, 0.0, -G))
+    np.testing.assert_allclose(force, [0.0, 0.0, 2.0 * G * 0.5 / 0.9], atol=1e-5)
+
+
+def test_a_puck_that_hardly_moves_feels_no_friction_of_the_ground():
+    puck = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 0.1), v=(1e-9, 0.0))
+    bodies = {"puck": puck, "wall": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))}
+    forces = {"ice": dr.GroundFriction(friction=0.6), "push": dr.Force("puck", F=(0.0, -0.5))}
+    np.testing.assert_allclose(pressed(bodies, {}, forces=forces), [0.0, 0.5], atol=1e-6)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_impulse_between_two_bodies_is_found_at_corner_edge_and_round(dim):
     """Central impacts of equal masses at t = 0.35 h: the first gives its velocity to the second."""
