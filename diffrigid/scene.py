@@ -1,6 +1,6 @@
 """`scene`: from bodies as users write them to `(World, State)`. All values are checked on the way."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import Any
@@ -146,9 +146,7 @@ def scene(
     dim, n = _dimension(moving, gravity), len(moving)
     named_forces = _forces(forces, gravity, everything, moving, dim)
     joined, linked, joint_names = _joints(joints, named_forces, moving, still, dim)
-    if isinstance(ignore, str) or not isinstance(ignore, Iterable):
-        raise ValueError(f"ignore is {ignore!r}: expected pairs of names, [('arm', 'hand')].")
-    passing = _passing([*ignore, *joined], list(everything))
+    passing = _passing([*_listed(ignore), *joined], list(everything))
     shapes = {k: None if b.shape is None else shape_of(k, b.shape, dim) for k, b in everything.items()}
     shapes |= looking_around(shapes, moving)
     solids = {name: solid_of(shapes[name], dim) for name in moving}
@@ -205,6 +203,15 @@ def _sorted(bodies: Mapping[str, Body | Static]) -> tuple[dict[str, Body], dict[
     if not moving:
         raise ValueError(f"bodies has no Body, only {list(bodies)}: expected one that moves; add a Body.")
     return moving, {name: body for name, body in bodies.items() if isinstance(body, Static)}
+
+
+def _listed(ignore: Any) -> list:
+    try:
+        if not isinstance(ignore, str):
+            return list(ignore)
+    except TypeError:  # also of an array without axes, which has `__iter__`
+        pass
+    raise ValueError(f"ignore is {ignore!r}: expected pairs of names, [('arm', 'hand')].")
 
 
 def _passing(ignore: Any, names: list[str]) -> set[frozenset[int]]:

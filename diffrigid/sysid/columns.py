@@ -84,6 +84,8 @@ def read_csv(path: str | Path, left_out: Collection[str] = ()) -> dict[str, np.n
         mark = next((mark for mark in ";\t" if texts and mark in texts[0]), ",")
         reader = csv.reader(texts, delimiter=mark)
         rows = [(numbers[reader.line_num - 1], row) for row in reader]
+    except UnicodeEncodeError:
+        raise ValueError(f"{str(path)!r} cannot be the name of a file") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV file: {error}") from None
     if not rows:
