@@ -19,9 +19,16 @@ def controlled(forces: tuple, axis: int = 0) -> dict[str, int]:
     Args:
         axis: of the components in the forces: the first, or where a batch comes first the last (-1).
     """
-    added = (force for force in forces if isinstance(force, Force | Torque))
-    sizes = {force.control: (force.F if isinstance(force, Force) else force.tau).shape[axis] for force in added}
-    return {name: size for name, size in sizes.items() if name is not None}
+    sizes: dict[str, int] = {}
+    for force in forces:
+        if isinstance(force, Force | Torque) and force.control is not None:
+            size = (force.F if isinstance(force, Force) else force.tau).shape[axis]
+            if sizes.setdefault(force.control, size) != size:
+                raise ValueError(
+                    f"controls: {force.control!r} is the control of a Force and of a Torque, which take unlike "
+                    "numbers: give them two names"
+                )
+    return sizes
 
 
 def as_controls(

@@ -10,7 +10,7 @@ import numpy as np
 
 from diffrigid.constraints import joint_rates, placed
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
-from diffrigid.joints import JOINTS, Distance, Pose, Revolute, separation
+from diffrigid.joints import JOINTS, Distance, Pose, Prismatic, Revolute, separation
 from diffrigid.linkage import ends_of, to_sides, twists_of
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
@@ -19,6 +19,8 @@ from diffrigid.state import State, rotations
 
 if TYPE_CHECKING:
     from diffrigid.world import World
+
+SHORT = 4.0  # [1/m] times the arms of a joint: on short ones typed numbers are off by less
 
 
 def joints_of(
@@ -76,13 +78,31 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
     given = _given(name, joint, fields, dim)
     filled = replace(joint, **given, **_from_start(so, fields, given, a, b), **ends)
     error = known(lambda joint, a, b: joint(so, a, b), filled, a, b)
-    if not traced(error) and np.abs(error).max() > TYPED:
+    if not traced(error) and (np.abs(error) > _allowed(filled, so, a, b, joint.b is None, len(error))).any():
         raise ValueError(
             f"{name} does not hold at the start: it is off by {np.linalg.norm(error):.3g} (m, rad); move a body, or "
             "leave out what belongs to b, which is then taken from the start."
         )
     _check_drive(name, filled, so, a, b)
     return filled
+
+
+def _allowed(joint: Any, so: Any, a: Pose, b: Pose, to_world: bool, rows: int) -> np.ndarray:
+    """Errors (E,) [m, rad] that typed numbers, or the rounding of large ones, explain."""
+    arms = float(np.linalg.norm(joint.anchor_a) + (0.0 if to_world else np.linalg.norm(joint.anchor_b)))
+    metres = {Distance: 1, Prismatic: so.D - 1}.get(type(joint), so.D)
+    of_places = max(TYPED * min(1.0, SHORT * arms), _rounding() * float(_places(joint, a, b)))
+    return np.where(np.arange(rows) < metres, of_places, TYPED)
+
+
+def _places(joint: Any, a: Pose, b: Pose) -> Any:
+    """Sum of the lengths that the error of a joint is the difference of, (*batch) [m]."""
+    return norm(a.x) + norm(b.x) + norm(joint.anchor_a) + norm(joint.anchor_b)
+
+
+def _rounding() -> float:
+    """Rounding of what is computed of several numbers, [-] relative to them."""
+    return float(64.0 * jnp.finfo(jnp.result_type(float)).eps)
 
 
 def _given(name: str, joint: Any, fields: list[str], dim: int) -> dict[str, Any]:
@@ -153,17 +173,22 @@ def warn_of_torn_joints(world: "World", state: State) -> None:
     if not world.joints:
         return
 
+    so = rotations(world.dim)
+
     def speeds(world: "World", state: State) -> Any:
         parts = []
         for group in world.joints:
             at = placed((group,), world.statics, state.x, state.q)
-            rates = joint_rates(rotations(world.dim), at, to_sides(ends_of((group,)), twists_of(state)))
-            parts.append(jnp.sqrt((rates**2).sum(1)))
-        return jnp.concatenate(parts)
+            u = to_sides(ends_of((group,)), twists_of(state))
+            rates, places = joint_rates(so, at, u), jax.vmap(_places)(*at[0])
+            sizes = jnp.sqrt((u[..., : so.D] ** 2).sum((1, 2))) + places * jnp.sqrt((u[..., so.D :] ** 2).sum((1, 2)))
+            parts.append(jnp.stack([jnp.sqrt((rates**2).sum(1)), jnp.maximum(_rounding() * sizes, TYPED)]))
+        return jnp.concatenate(parts, axis=1)
 
-    rates = known(speeds, jax.tree.map(jnp.asarray, world), jax.tree.map(jnp.asarray, state))
-    for name, speed in zip([name for group in world.joint_names for name in group], rates, strict=True):
-        if speed > TYPED:
+    rates, allowed = known(speeds, jax.tree.map(jnp.asarray, world), jax.tree.map(jnp.asarray, state))
+    names = [name for group in world.joint_names for name in group]
+    for name, speed, most in zip(names, rates, allowed, strict=True):
+        if speed > most:
             warnings.warn(
                 f"{name}: velocities at the start do not fit, the joint comes apart at {speed:.3g} m/s or rad/s; the "
                 "motion begins with the impulse that mends it. Give the bodies v and w that fit.",

@@ -60,7 +60,10 @@ def _equal(record, other) -> bool:
     tree: Any = jax.tree.structure(record)
     if type(record) is not type(other) or tree != jax.tree.structure(other):
         return False
-    return all(map(np.array_equal, jax.tree.leaves(record), jax.tree.leaves(other)))
+    leaves = jax.tree.leaves(record), jax.tree.leaves(other)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in (*leaves[0], *leaves[1])):
+        raise TypeError("==: the numbers of a record are not known while JAX traces; compare the arrays themselves")
+    return all(map(np.array_equal, *leaves))
 
 
 def map_arrays(fn, node, where: str = "", stack: tuple[str, ...] = ()):

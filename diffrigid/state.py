@@ -4,9 +4,11 @@ x is the centre of mass, in the world frame; v and w are in the world frame. Not
 """
 
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from diffrigid import so2, so3
@@ -87,7 +89,7 @@ def kinetic_energy(bodies: Bodies, state: State) -> Array:
         >>> round(float(energy[-1, 0]), 4)
         3.5348
     """
-    bodies, state = align_all(bodies, state)
+    bodies, state = _together(bodies, state)
     linear = bodies.mass * (state.v * state.v).sum(1)
     return 0.5 * (linear + (state.w * spin(bodies, state)).sum(1))
 
@@ -99,7 +101,7 @@ def momentum(bodies: Bodies, state: State) -> Array:
         >>> dr.momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()
         [[2.0, 0.0]]
     """
-    bodies, state = align_all(bodies, state)
+    bodies, state = _together(bodies, state)
     return bodies.mass[:, None] * state.v
 
 
@@ -110,12 +112,31 @@ def angular_momentum(bodies: Bodies, state: State) -> Array:
         >>> dr.angular_momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()  # no spin: an arm
         [[-2.0]]
     """
-    bodies, state = align_all(bodies, state)
+    bodies, state = _together(bodies, state)
     orbital = jax.vmap(rotations(bodies.dim).moment)(state.x, momentum(bodies, state))
     return orbital + spin(bodies, state)
 
 
-def material_point(state: State, body: int, point: Array) -> Array:
+def _together(bodies: Bodies, state: State) -> tuple[Bodies, State]:
+    """Bodies and a state of them, with the same number of batch axes."""
+    count = len(bodies.mass)
+    _refuse_times(state, bodies.dim, count, "jax.vmap(dr.kinetic_energy, (None, 0))(world.bodies, trajectory.state)")
+    return tuple(align_all(bodies, state))
+
+
+def _refuse_times(state: State, dim: int, count: int, instead: str) -> None:
+    """Raise ValueError for a state that is not that of `count` bodies, as where an axis of times comes first."""
+    sizes = axis_sizes(dim)
+    wanted = {name: (count, sizes[letter]) for name, letter in (("x", "D"), ("q", "Q"), ("v", "D"), ("w", "A"))}
+    for name, shape in wanted.items():
+        if (found := jnp.shape(getattr(state, name)))[:2] != shape:
+            raise ValueError(
+                f"state.{name} has shape {found}: expected {shape}, and axes of a batch behind; of all times of a "
+                f"trajectory: {instead}"
+            )
+
+
+def material_point(state: State, body: int, point: Any) -> Array:
     """World position of a point fixed to a body, r = R r_b + x, (D, *batch) [m].
 
     Args:
@@ -127,11 +148,11 @@ def material_point(state: State, body: int, point: Array) -> Array:
         >>> dr.material_point(quarter, 0, jnp.array([0.1, 0.0])).tolist()
         [0.0, 1.1]
     """
-    state, point = _aligned(state, point)
+    state, point = _aligned(state, body, point)
     return state.x[body] + rotations(state.x.shape[1]).rotate(state.q[body], point)
 
 
-def material_velocity(state: State, body: int, point: Array) -> Array:
+def material_velocity(state: State, body: int, point: Any) -> Array:
     """World velocity of a point fixed to a body, v + w x (R r_b), (D, *batch) [m/s]. Arguments as above.
 
     Example:
@@ -139,12 +160,18 @@ def material_velocity(state: State, body: int, point: Array) -> Array:
         >>> dr.material_velocity(spinning, 0, jnp.array([0.1, 0.0])).tolist()
         [0.0, 0.5]
     """
-    state, point = _aligned(state, point)
+    state, point = _aligned(state, body, point)
     so = rotations(state.x.shape[1])
     return state.v[body] + so.cross(state.w[body], so.rotate(state.q[body], point))
 
 
-def _aligned(state: State, point: Array) -> tuple[State, Array]:
+def _aligned(state: State, body: int, point: Any) -> tuple[State, Array]:
     """State and a point (D, *batch) with the same number of batch axes."""
+    point, count, dim = jnp.asarray(point), len(state.x), 2 if state.q.shape[1] == 2 else 3
+    _refuse_times(state, dim, count, "jax.vmap(lambda state: dr.material_point(state, 0, point))(trajectory.state)")
+    if not isinstance(body, jax.core.Tracer) and not (isinstance(body, int | np.integer) and -count <= body < count):
+        raise ValueError(f"body is {body!r}: expected the number of a body, from 0 to {count - 1}, as in world.names")
+    if point.shape[:1] != (dim,):
+        raise ValueError(f"point has shape {point.shape}: expected ({dim},), and axes of a batch behind")
     rank = max(batch_rank(state), jnp.ndim(point) - 1)
     return align(state, rank), jnp.reshape(point, jnp.shape(point) + (1,) * (rank + 1 - jnp.ndim(point)))

@@ -143,6 +143,24 @@ def test_energy_momenta_and_points_of_a_batch_are_those_of_each_world(dim):
             assert_allclose(fn(alone, 1, points)[..., k], fn(alone, 1, points[:, k]), rtol=ROUNDING)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_states_of_a_trajectory_are_not_taken_for_one(count):
+    """An axis of times in front, of any length, also that of the bodies."""
+    world, state = dr.scene({str(k): dr.Body(dr.Disc(radius=0.1), mass=1.0 + k, x=(k, 0.0)) for k in range(3)})
+    times = jax.tree.map(lambda leaf: jnp.stack([leaf] * count), state)
+    for fn in (dr.kinetic_energy, dr.momentum, dr.angular_momentum):
+        with pytest.raises(ValueError, match=r"state\.x has shape .*, 3, 2\): expected \(3, 2\).*jax\.vmap"):
+            fn(world.bodies, times)
+    for fn in (dr.material_point, dr.material_velocity):
+        with pytest.raises(ValueError, match=r"state\.\w has shape .*expected .*jax\.vmap"):
+            fn(jax.tree.map(lambda leaf: leaf[:, :2], times), 0, (0.1, 0.0))
+        for body in (3, -4, "0", 0.0, None):
+            with pytest.raises(ValueError, match="body is .*expected the number of a body, from 0 to 2"):
+                fn(state, body, (0.1, 0.0))
+        with pytest.raises(ValueError, match=r"point has shape \(3,\): expected \(2,\)"):
+            fn(state, 0, (0.1, 0.0, 0.0))
+
+
 def test_a_trajectory_of_many_worlds_is_read_by_path_in_each():
     """By `vmap` of `rollout`; states of `rollout_batch` have no times of their own, and are refused."""
     bodies = {name: dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(x, 1.0)) for name, x in (("a", 0.0), ("b", 3.0))}

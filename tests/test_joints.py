@@ -297,6 +297,19 @@ def test_a_start_that_tears_a_joint_is_reported():
     assert_allclose(after.w[0, 0], 1.0, rtol=EXACT)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_digits_of_a_joint_that_count_are_those_of_its_unit(kind):
+    """A hinge far out in millimetres, rounded; one that is 90 um off on a body of 100 um."""
+    place, w = np.array([2000.3, 1500.7], kind), kind(0.01)
+    with jax.enable_x64(kind is np.float64):
+        arm = dr.Body(None, mass=1.0, inertia=1.0, x=place + kind(0.7), v=0.7 * w * np.array([-1.0, 1.0]), w=w)
+        hinge = dr.Revolute("arm", anchor_a=np.full(2, -0.7, kind), anchor_b=place)
+        dr.scene({"arm": arm}, joints=[hinge])
+        tiny = dr.Body(None, mass=1.0, inertia=1.0, x=(1e-4, 0.0))
+        with pytest.raises(ValueError, match="does not hold at the start: it is off by 9e-05"):
+            dr.scene({"arm": tiny}, joints=[dr.Revolute("arm", anchor_a=(-1e-4, 9e-5), anchor_b=(0.0, 0.0))])
+
+
 @pytest.mark.filterwarnings("ignore:.*velocities at the start do not fit")
 def test_an_impulse_of_the_joints_makes_velocities_fit_at_the_start():
     """Two free bodies on a hinge at the origin: the impulse by hand, and what keeps at any step afterwards."""

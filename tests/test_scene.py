@@ -133,6 +133,13 @@ RUNS = {
         r"state\.x has shape \(2, 2\), expected \(N=1",
         lambda w, _: dr.step(w, dr.scene({"a": ball(), "b": ball(x=(5.0, 0.0))})[1], 0.1),
     ),
+    "one control of two sizes": (
+        "'u' is the control of a Force and of a Torque",
+        lambda *_: dr.step(
+            *dr.scene({"ball": ball()}, forces=[dr.Force("ball", control="u"), dr.Torque("ball", control="u")]),
+            0.1, {"u": np.ones(1)},
+        ),
+    ),
     "integers": (
         r"state\.v has type int.*, expected floating point: convert",
         lambda w, s: dr.step(w, dr.replace(s, v=jnp.zeros((1, 2), int)), 0.1),

@@ -103,6 +103,14 @@ def test_records_of_two_classes_are_never_alike():
     assert jax.tree.structure(Disc(radius=1.0)) != jax.tree.structure(Sphere(radius=1.0))
 
 
+def test_records_are_not_compared_while_their_numbers_are_unknown():
+    disc = Disc(radius=1.0)
+    assert disc == Disc(radius=1.0) and disc != Disc(radius=2.0) and disc != Sphere(radius=1.0)
+    for trace in (jax.jit, jax.grad):
+        with pytest.raises(TypeError, match="not known while JAX traces"):
+            trace(lambda radius: 1.0 * (Disc(radius=radius) == disc))(1.0)
+
+
 def test_regular_polygons_tend_to_the_disc():
     for n in (12, 48):
         volume, _, gyration = volume_properties(Polygon(vertices=circle(n)), 2)
