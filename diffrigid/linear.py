@@ -5,15 +5,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from diffrigid.branches import opaque_true, unfused
 from diffrigid.gathers import MANY, fold
 from diffrigid.numerics import safe_divide
 
-TINY = 6  # rows of a matrix, up to which its elimination is unrolled
-SMALL = 9  # rows of a matrix, up to which a whole batch at once is faster than a library that takes one by one
+UNROLLED = 6  # rows of a matrix, up to which its elimination is unrolled
 
 # Else a GPU rounds factors in single precision to ten bits.
 matmul = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
@@ -37,10 +35,8 @@ def solve_regular(matrix: Array, right: Array) -> Array:
 
 def _eliminated(matrix: Array, right: Array) -> Array:
     system = jnp.concatenate([matrix, right[:, None]], axis=1)
-    if len(matrix) <= TINY:
+    if len(matrix) <= UNROLLED:
         return _written_out(system)
-    if len(matrix) <= SMALL:
-        return _gauss(system)
     # Not fused, for else all that the matrix is made of is computed in the order of the transposed one.
     system = unfused(opaque_true(right), lambda system: system, system)
     # What elimination makes of the right side beside the matrix needs no permutation. With a row below the system is
@@ -79,37 +75,3 @@ def _written_out(system: Array) -> Array:
     for row in reversed(eliminated):
         x.insert(0, functools.reduce(jnp.subtract, [a * b for a, b in zip(row[:-1], x, strict=True)], row[-1]))
     return jnp.stack(x)
-
-
-def _gauss(system: Array) -> Array:
-    """Solve a system given as a matrix beside its right side, (R, R + 1, *batch) -> (R, *batch), with pivoting.
-
-    Pivots are chosen by column in each matrix of the batch; rows stay where they are. A direction whose pivot is 0 is
-    left out. Rows that had their turn are not touched again: cleared too (Gauss-Jordan) they leave residuals as large
-    as the matrix is badly conditioned.
-    """
-    count = system.shape[0]
-    index = lax.broadcasted_iota(np.int32, (count, *system.shape[2:]), 0)
-
-    def eliminate(k, carry):
-        system, order = carry
-        column = lax.dynamic_index_in_dim(system, k, 1, keepdims=False)
-        waits = order == count
-        best = jnp.argmax(jnp.where(waits, jnp.abs(column), -1.0), 0)
-        chosen = index == best.astype(np.int32)[None]
-        row = jnp.where(chosen[:, None], system, 0.0).sum(0)
-        pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
-        row = row * safe_divide(jnp.ones_like(pivot), pivot)[None]
-        below = jnp.where(waits, column, 0.0)
-        system = jnp.where(chosen[:, None], row[None], system - below[:, None] * row[None])
-        return system, jnp.where(chosen, k, order)
-
-    system, order = lax.fori_loop(0, count, eliminate, (system, jnp.full_like(index, count)))
-
-    def substitute(step, x):
-        k = count - 1 - step
-        row = jnp.where((order == k)[:, None], system, 0.0).sum(0)
-        known = jnp.where(index > k, row[:count] * x, 0.0).sum(0)
-        return jnp.where(index == k, (row[count] - known)[None], x)
-
-    return lax.fori_loop(0, count, substitute, jnp.zeros_like(system[:, 0]))
