@@ -91,7 +91,7 @@ def _allowed(joint: Any, so: Any, a: Pose, b: Pose, to_world: bool, rows: int) -
     """Errors (E,) [m, rad] that typed numbers, or the rounding of large ones, explain."""
     arms = float(np.linalg.norm(joint.anchor_a) + (0.0 if to_world else np.linalg.norm(joint.anchor_b)))
     metres = {Distance: 1, Prismatic: so.D - 1}.get(type(joint), so.D)
-    of_places = max(TYPED * min(1.0, SHORT * arms), _rounding() * float(_places(joint, a, b)))
+    of_places = max(TYPED * min(1.0, SHORT * arms), _rounding() * float(known(_places, joint, a, b)))
     return np.where(np.arange(rows) < metres, of_places, TYPED)
 
 

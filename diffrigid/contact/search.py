@@ -98,7 +98,28 @@ class Found(NamedTuple):
 
 
 def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Found:
-    clear, no = clearance(task), start < start
+    near, over, rests = _come_near(task, start, at_end, live)
+
+    def approach(near):
+        def look(now):
+            return nearer(task, now, gaps_at(task.a, task.b, now.t, live))
+
+        seen = lax.while_loop(lambda now: ~at_end & any_world(~now.done), look, from_time(near))
+        return _polished_from(task, near, seen), seen.level(task.width), seen.closest()
+
+    def exact(near):
+        return near, jnp.zeros_like(near), from_time(near).closest()
+
+    near, level, nearest = if_smooth(task.width, approach, exact, near)
+    nothing = over & (level <= 0)
+    s, look = _closed_in(task, near, level, rests, nothing | at_end, live)
+    found = look.found(task) & ~nothing
+    return Found(s, near, level, found, look.inside & ~nothing, rests, None if task.width is None else nearest)
+
+
+def _come_near(task: Task, start: Array, at_end: Array, live: Array) -> tuple[Array, Array, Array]:
+    """Where a pair that advances comes near [s], whether its step is over before, and which contacts rest."""
+    clear = clearance(task)
 
     def safe(s, dt):  # the step is over long before anything closes: the normal of a half-space does not turn
         return dt >= 2.0 * (task.t1 - s)
@@ -117,24 +138,18 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
     first = (0, start, jnp.zeros_like(start), jnp.zeros((_count(task, start, live), *start.shape), bool))
     _, near, dt, rests = lax.while_loop(flying, advance, first)
     over = (near < task.t1) & safe(near, dt)
-    near = jnp.where(over, task.t1, near)
+    return jnp.where(over, task.t1, near), over, rests
 
-    def approach(near):
-        def look(now):
-            return nearer(task, now, gaps_at(task.a, task.b, now.t, live))
 
-        seen = lax.while_loop(lambda now: ~at_end & any_world(~now.done), look, from_time(near))
-        return _polished_from(task, near, seen), seen.level(task.width), seen.closest()
-
-    def exact(near):
-        return near, jnp.zeros_like(near), from_time(near).closest()
-
-    near, level, nearest = if_smooth(task.width, approach, exact, near)
-    nothing = over & (level <= 0)
+def _closed_in(
+    task: Task, near: Array, level: Array, rests: Array, nothing: Array, live: Array
+) -> tuple[Array, Polish]:
+    """The time [s] at which a pair that is near reaches its level, and the last look; `near` where there is nothing."""
+    no = near < near
 
     def polishing(carry):
         count, _, look = carry
-        return ~at_end & (count <= POLISH) & any_world(jnp.where(count == 0, ~nothing, ~look.converged(task)))
+        return (count <= POLISH) & any_world(jnp.where(count == 0, ~nothing, ~look.converged(task)))
 
     def along(carry):
         count, s, before = carry
@@ -142,8 +157,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
         return count + 1, s + look.dt, look._replace(inside=jnp.where(count == 0, look.inside, before.inside))
 
     _, s, look = lax.while_loop(polishing, along, (0, near, Polish(jnp.zeros_like(near), no, no, no)))
-    found = look.found(task) & ~nothing
-    return Found(s, near, level, found, look.inside & ~nothing, rests, None if task.width is None else nearest)
+    return s, look
 
 
 def _count(task: Task, start: Array, live: Array) -> int:

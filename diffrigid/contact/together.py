@@ -136,21 +136,11 @@ def _again(now: Newton, given: tuple[Cone, Array, Arms, Mobility]) -> Newton:
     leaves = (P != to).any(1) & ((slope.slides == 0) | (split(cone.normal, to)[0] < 0))
     z, r = _missing(P, *given)
 
-    stays = _lacks(cone, now) & (now.since >= PATIENCE)
-    rounds = jnp.where(any_world(stays), SMOOTHING << (now.count // DOUBLES), SMOOTHING)
-
-    def smoothed(P, _, r):
-        half = allowed(cone, now.P + 0.5 * dP)
-        nearer = _speed(cone, _missing(half, *given)[1]) < _speed(cone, r)
-        before = jnp.where(now.since == PATIENCE, now.best, now.P)
-        P = jnp.where(now.since >= PATIENCE, before, jnp.where(nearer[None, None], half, P))
-        P = _smoothed(P, jnp.minimum(rounds, SMOOTHEST), *given)
-        return P, *_missing(P, *given)
-
     poor = _lacks(cone, now) & (_speed(cone, r) > LITTLE * now.error)
     again = poor & leaves.any(0) & ~now.tried
     strays = (now.error <= _compliance(P) * _speed(cone, now.best)) & (now.since < PATIENCE)
-    P, z, r = lax.cond(any_world(poor & ~again & ~strays), smoothed, lambda *kept: kept, P, z, r)
+    improved = functools.partial(_improved, now, given, dP)
+    P, z, r = lax.cond(any_world(poor & ~again & ~strays), improved, lambda *kept: kept, P, z, r)
     P, z, r = (jnp.where(again[None, None], old, new) for old, new in ((now.P, P), (now.z, z), (now.r, r)))
     if mobility.inverse_mass.shape[0] >= PILE:
         lost = (now.count > 0) & (now.count % CIRCLES == 0) & _circles(cone, now) & ~again
@@ -171,6 +161,22 @@ def _again(now: Newton, given: tuple[Cone, Array, Arms, Mobility]) -> Newton:
     return Newton(
         now.count + 1, now.rigid, now.rest, again, at, P, z, r, best, jnp.minimum(size, now.error), since, mark
     )  # fmt: skip
+
+
+def _improved(
+    now: Newton, given: tuple[Cone, Array, Arms, Mobility], dP: Array, P: Array, z: Array, r: Array
+) -> tuple[Array, Array, Array]:
+    """Smooth the better of a whole step and half of it; without progress, the best so far."""
+    del z
+    cone = given[0]
+    stays = _lacks(cone, now) & (now.since >= PATIENCE)
+    rounds = jnp.where(any_world(stays), SMOOTHING << (now.count // DOUBLES), SMOOTHING)
+    half = allowed(cone, now.P + 0.5 * dP)
+    nearer = _speed(cone, _missing(half, *given)[1]) < _speed(cone, r)
+    before = jnp.where(now.since == PATIENCE, now.best, now.P)
+    P = jnp.where(now.since >= PATIENCE, before, jnp.where(nearer[None, None], half, P))
+    P = _smoothed(P, jnp.minimum(rounds, SMOOTHEST), *given)
+    return P, *_missing(P, *given)
 
 
 def _yields(cone: Cone, now: Newton) -> Array:
