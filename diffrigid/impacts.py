@@ -20,7 +20,7 @@ from diffrigid.hull import hull_faces
 from diffrigid.impulses import Changes, changes_of, impulses_at
 from diffrigid.pytree import replace
 from diffrigid.shapes import UNEVEN, Box, HalfSpace, Hull, edges, radius, vertices
-from diffrigid.tables import lined_up
+from diffrigid.tables import lined_up, moment
 from diffrigid.touch import Convex, gaps
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.world import World
@@ -52,13 +52,13 @@ class Meetings(NamedTuple):
         pairs = np.array([f"{self.names[a]}-{self.names[b]}" for a, b in zip(self.a, self.b, strict=True)], object)
         strikes = np.flatnonzero(self.impact)
         rows = [
-            (f"{self.t[k]:.5g}", pairs[k], _numbers(self.point[k]), _numbers(self.impulse[k])) for k in strikes[:SHOWN]
+            (moment(self.t[k]), pairs[k], _numbers(self.point[k]), _numbers(self.impulse[k])) for k in strikes[:SHOWN]
         ]
         lines = lined_up(("impact at t [s]", "pair", "point [m]", "impulse [N s]"), rows)
         lines += [f"and {len(strikes) - SHOWN} more"] if len(strikes) > SHOWN else []
         for pair in dict.fromkeys(pairs[~self.impact]):
             t = self.t[~self.impact & (pairs == pair)]
-            lines.append(f"at rest: {pair}, {len(t)} contacts from {t[0]:.3g} to {t[-1]:.3g} s")
+            lines.append(f"at rest: {pair}, {len(t)} contacts from {moment(t[0], 3)} to {moment(t[-1], 3)} s")
         return "\n".join(lines)
 
 
@@ -132,7 +132,7 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     impact = touch.new | rough
     drawn = np.ones(len(touch.s), bool)
     if times is not None:
-        drawn = np.isin(touch.interval, np.searchsorted(motion.t, times - 1e-9 * motion.t[-1]))
+        drawn = np.isin(touch.interval, np.searchsorted(motion.t, times - 0.5 * np.diff(motion.t).min()))
     kept = (size > 1e-6 * size.max()) & (impact | drawn)
     t = motion.t[touch.interval] + touch.s
     kept = np.flatnonzero(kept)[np.argsort(t[kept], kind="stable")]

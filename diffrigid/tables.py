@@ -5,6 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+LONG = 1e4  # [s] on a clock that began long ago
+
 
 def digits(value: float, low: float, high: float, least: int) -> int:
     """Number of significant digits that show the width of an interval to two places, at least `least`."""
@@ -12,6 +14,18 @@ def digits(value: float, low: float, high: float, least: int) -> int:
     if not np.isfinite(width) or width == 0 or size == 0:
         return 4
     return int(np.clip(np.ceil(np.log10(size / width)) + 2, least, 12))
+
+
+def moment(t: float, least: int = 5) -> str:
+    """A time [s] as text: to `least` digits, and to 0.1 ms where its clock began long ago."""
+    return f"{t:.{least}g}" if abs(t) < LONG else f"{t:.4f}"
+
+
+def labels(numbers: np.ndarray) -> list[str]:
+    """Numbers as text, with enough digits to tell them apart, at least six."""
+    span = np.ptp(numbers)
+    more = np.log10(max(np.abs(numbers).max() / span, 1.0)) if span > 0 else 0.0
+    return [f"{number:.{6 + int(more)}g}" for number in numbers]
 
 
 def lined_up(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

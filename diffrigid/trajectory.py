@@ -10,6 +10,7 @@ from diffrigid.paths import read
 from diffrigid.pytree import array, batch_rank, pytree
 from diffrigid.shapes import traced
 from diffrigid.state import State
+from diffrigid.tables import moment
 from diffrigid.world import World
 
 
@@ -50,7 +51,7 @@ class Trajectory:
         """What it holds, and when; `state` and `world` print their numbers."""
         when = f"t of shape {np.shape(self.t)}"
         if isinstance(self.t, Array | np.ndarray) and not traced(self.t) and self.t.ndim == 1 and len(self.t):
-            when = f"{len(self.t)} times, {self.t[0]:.5g} to {self.t[-1]:.5g} s"
+            when = f"{len(self.t)} times, {moment(float(self.t[0]))} to {moment(float(self.t[-1]))} s"
         return f"Trajectory of {', '.join(self.world.names)}: {when}; state.x of shape {np.shape(self.state.x)}"
 
     def _repr_html_(self) -> str | None:

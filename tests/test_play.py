@@ -12,6 +12,7 @@ from motions import DOWN, HEIGHT, IMPACT, MASS, RADIUS, E, G, T, bounce, traject
 
 import diffrigid as dr
 from diffrigid.view.frames import contacts, energies
+from diffrigid.view.report import Curve, chart
 
 
 def content(player):
@@ -118,6 +119,22 @@ def test_an_impact_is_found_at_its_time_with_its_impulse(dim, spin):
     np.testing.assert_allclose(impact[2 : 2 + dim], np.zeros(dim), atol=1e-4)
     np.testing.assert_allclose(impact[2 + dim :], MASS * (1 + E) * DOWN * np.eye(dim)[-1], atol=1e-6 * MASS * DOWN)
     assert repr(dr.contacts(run)).splitlines()[2].startswith(f"{impact[0]:.5g}  ")
+
+
+def test_a_clock_that_began_long_ago_shows_and_draws_the_same():
+    """Seconds since 1970 have 2e-7 s of rounding; of the tick labels all are different."""
+    run, long_ago = bounce(), 1.7e9
+    late = dr.replace(run, t=T + long_ago)
+    tables = contacts(run, T), contacts(late, T + long_ago)
+    np.testing.assert_allclose(
+        tables[1] - tables[0], np.broadcast_to(long_ago * np.eye(6)[0], tables[0].shape), atol=1e-5
+    )
+    drawn, _ = unpacked(content(dr.play(late))["runs"][0]["contacts"])
+    np.testing.assert_allclose(drawn[:, 0], tables[1][:, 0], atol=1e-5)
+    impact = f"{tables[1][tables[0][:, 1] == 1, 0][0]:.4f}"
+    assert repr(dr.contacts(late)).splitlines()[2].startswith(impact) and "1700000000.9000 s" in repr(late)
+    ticks = re.findall(r'text-anchor="middle">(17[^<]*)<', chart("", "", "", [Curve(late.t, T)]))
+    assert ticks == [f"170000000{second}" for second in ("0", "0.2", "0.4", "0.6", "0.8")]
 
 
 @pytest.mark.parametrize(("dim", "points"), [(2, 2), (3, 4)])

@@ -11,6 +11,7 @@ from diffrigid.convert import known_number
 from diffrigid.state import State
 from diffrigid.sysid.columns import Series, check_mapping, columns
 from diffrigid.sysid.sensors import Channel
+from diffrigid.tables import moment
 from diffrigid.world import World, check
 
 SAME = 1e-9  # [s] times of different columns that are this close are the same
@@ -100,7 +101,9 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
     first = min(float(s.t[0]) for s in series)
     start = first if record.start is None else float(known_number(f"{where}.start", record.start))
     if start > first:
-        raise ValueError(f"{where}: start is {start:g} s, after the first measured time {first:g} s: make it earlier")
+        raise ValueError(
+            f"{where}: start is {moment(start)} s, after the first measured time {moment(first)} s: make it earlier"
+        )
     if missing := controlled(world.forces).keys() - {control.name for control in controls}:
         raise ValueError(
             f"{where} has no column {min(missing)!r}, which a force takes as its control: give zeros where nothing "
@@ -109,8 +112,8 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
     for control in controls:
         if control.t[0] > start + SAME:
             raise ValueError(
-                f"{where}[{control.name!r}] begins at {control.t[0]:g} s, after the start {start:g} s: what acts "
-                "before?"
+                f"{where}[{control.name!r}] begins at {moment(control.t[0])} s, after the start {moment(start)} s: "
+                "what acts before?"
             )
     given = {name: sigma for name, sigma in noise.items() if name in names} | own
     return Run(world, state, channels, series, start, given, controls, record.state is not None)

@@ -40,7 +40,7 @@ def pack(table: np.ndarray) -> dict[str, Any]:
     levels = np.rint((table - low) / np.where(step > 0, step, 1.0))
     whole = np.where(known, np.clip(np.nan_to_num(levels), 0, LEVELS), LEVELS + 1).astype("<u2")
     data = base64.b64encode(whole.T.tobytes()).decode()
-    return {"low": [float(f"{v:.10g}") for v in low], "step": step.tolist(), "rows": len(table), "data": data}
+    return {"low": low.tolist(), "step": step.tolist(), "rows": len(table), "data": data}
 
 
 def times(t: np.ndarray) -> Any:

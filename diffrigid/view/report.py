@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diffrigid.tables import as_html, digits, lined_up
+from diffrigid.tables import as_html, digits, labels, lined_up
 from diffrigid.view.play import POLICY, Player
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "truth or published value")
@@ -171,15 +171,17 @@ def _axes(place, x_range, y_range, corner) -> list[str]:
     """Grid, tick labels, and the zero line where there is one."""
     right, bottom = corner
     parts = []
-    for tick in _ticks(*x_range):
+    ticks = _ticks(*x_range)
+    for tick, label in zip(ticks, labels(ticks), strict=True):
         x, _ = place(tick, y_range[0])
         parts.append(f'<path class="grid" d="M{x:.1f} {TOP}V{bottom}"/>')
-        parts.append(_text("tick", x, bottom + 14, f"{tick:.6g}", "middle"))
-    for tick in _ticks(*y_range):
+        parts.append(_text("tick", x, bottom + 14, label, "middle"))
+    ticks = _ticks(*y_range)
+    for tick, label in zip(ticks, labels(ticks), strict=True):
         _, y = place(x_range[0], tick)
         kind = "grid zero" if abs(tick) < 1e-12 else "grid"
         parts.append(f'<path class="{kind}" d="M{LEFT} {y:.1f}H{right}"/>')
-        parts.append(_text("tick", LEFT - 6, y + 3.5, f"{tick:.6g}", "end"))
+        parts.append(_text("tick", LEFT - 6, y + 3.5, label, "end"))
     return parts
 
 
