@@ -95,6 +95,18 @@ def test_noise_and_intervals_are_those_of_linear_regression(fit, exact):
     assert_allclose(half, stdtrit(freedom, 0.975) * np.sqrt(np.diag(covariance)[:2]), rtol=1e-6)
 
 
+def test_noise_far_below_the_unit_of_its_column_is_found():
+    """An interferometer: 0.1 nm of noise on a micrometre, by linear regression."""
+    t, random = np.linspace(0.0, 1.0, 40), np.random.default_rng(0)
+    x = 1e-6 * t[:, None] * (1.0, -1.0) + 1e-10 * random.standard_normal((40, 2))
+    world, state = dr.scene({"p": dr.Body(None, mass=1.0, inertia=1.0, x=(0.0, 0.0), v=(1e-6, 0.0))})
+    found = dr.fit(world, state, {"t": t, "p.x": x}, free={"p.x": dr.real(), "p.v": dr.real()}, progress=False)
+    matrix = np.stack([np.ones(40), t], axis=1)
+    squares = ((matrix @ np.linalg.lstsq(matrix, x)[0] - x) ** 2).sum()
+    assert_allclose(found.noise["p.x"], np.sqrt(squares / (80 - 4)), rtol=1e-4)
+    assert not any("rounding" in note for note in found.notes)
+
+
 def test_akaike_of_a_linear_regression(fit, exact):
     matrix, right, *_ = exact
     squares = ((matrix @ np.linalg.lstsq(matrix, right)[0] - right) ** 2).sum() / fit.noise["p.x"] ** 2

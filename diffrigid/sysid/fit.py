@@ -30,7 +30,7 @@ from diffrigid.sysid.parameters import pieces
 from diffrigid.sysid.points import by_column, linear_of, row_mask
 from diffrigid.sysid.remarks import beside_a_jump, failed, remarks_on, sticking
 from diffrigid.sysid.result import Fit
-from diffrigid.sysid.setup import LEAST, Problem, fitted_scenes, make_problem, make_starts, reach_of, with_noise
+from diffrigid.sysid.setup import Problem, fitted_scenes, least_noise, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 
@@ -206,7 +206,7 @@ def estimated_noise(problem: Problem, point: Point, loss: Any) -> dict[str, floa
         values = np.concatenate([piece[np.isfinite(piece)] for piece in free])
         share = max(1.0 - lost[name] / max(len(values), 1), LEAST_FREE)
         size = np.mean(values**2) if isinstance(loss, Squares) else (1.4826 * np.median(np.abs(values))) ** 2
-        found[name] = max(float(sigma * np.sqrt(size / share)), LEAST) if len(values) else sigma
+        found[name] = max(float(sigma * np.sqrt(size / share)), least_noise(problem, name)) if len(values) else sigma
     return found
 
 

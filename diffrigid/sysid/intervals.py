@@ -26,7 +26,7 @@ from diffrigid.sysid.diagnosis import (
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
-from diffrigid.sysid.setup import LEAST, Problem, first_value, scene_having, scene_of
+from diffrigid.sysid.setup import Problem, first_value, least_noise, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import BLIND, BOUND
 from diffrigid.world import World
@@ -83,7 +83,7 @@ def _notes(
             "high) if values beyond it are possible; if not, dr.profile gives an interval that ends there"
         )
     notes += _together(uncertainty.covariance, places, blind)
-    exact = [name for name, sigma in problem.noise.items() if sigma <= LEAST]
+    exact = [name for name, sigma in problem.noise.items() if sigma <= least_noise(problem, name)]
     if exact:
         names = ", ".join(exact)
         notes.append(f"residuals of {names} are rounding, as of simulated data without noise: intervals mean nothing")

@@ -150,5 +150,5 @@ def noise_guess(values: np.ndarray, turn: float) -> float:
     second = second[np.isfinite(second)]
     if second.size == 0:
         return 1.0
-    floor = 1e-9 + 1e-6 * float(np.nanmax(np.abs(values)))
+    floor = 1e-6 * float(np.nanmax(np.abs(values))) or 1e-9
     return max(float(np.median(second)) / (0.6745 * np.sqrt(6.0)), floor)

@@ -32,7 +32,7 @@ from diffrigid.world import World
 
 MANY = 50_000  # steps of a record beyond which the unit of its times is doubted
 SPARSE = 40  # likewise steps from one row to the next, where their length was not given
-LEAST = 1e-9  # smallest noise that is estimated, in the unit of its column
+LEAST = 1e-12  # [-] of the largest value of its column: smaller noise is rounding, of a simulation in double precision
 
 
 @dataclass(frozen=True)
@@ -190,6 +190,13 @@ def _noise_guesses(found: Sequence[Run]) -> dict[str, float]:
             if series.name not in run.noise and np.isfinite(series.values).any():
                 guesses.setdefault(series.name, []).append(noise_guess(series.values, full_turn(run, series.name)))
     return {name: float(np.median(values)) for name, values in guesses.items()}
+
+
+def least_noise(problem: Problem, name: str) -> float:
+    """Smallest noise of a column that is estimated, in its unit: rounding of the simulation."""
+    values = [np.nan_to_num(series_of(run, name).values) for run in problem.runs if name in run.channels]
+    size = max(float(np.abs(part).max()) for part in values)
+    return max(LEAST, 8 * float(np.finfo(problem.dtype).eps)) * (size or 1.0)
 
 
 def _resumed(found: list[Run], saved: Any, slots: Sequence[Slot], places: Sequence[int | None]) -> list[Run]:
