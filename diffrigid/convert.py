@@ -301,6 +301,8 @@ def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
             )
         if target is not None:
             changes[field] = bodies.index(target)
+    if "a" in changes and changes["a"] == changes.get("b"):
+        raise ValueError(f"{name} ties {force.a!r} to itself: expected two bodies, or b=None for the world.")
     sizes = {"N": len(bodies)} | axis_sizes(dim)
 
     def fill(leaf, letters, path):

@@ -15,7 +15,7 @@ from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, at_least_one, largest, numbers
 from diffrigid.devices import on_cpu
-from diffrigid.pytree import map_arrays
+from diffrigid.pytree import batch_rank, map_arrays
 from diffrigid.scan import MEMORY, advance, aligned, joined, scan_steps
 from diffrigid.shapes import traced
 from diffrigid.state import State
@@ -117,7 +117,7 @@ def missed_pairs(world: World, state: State, dt: Any) -> Array:
         state: of one world, or with leading axes, as `rollout` and `rollout_batch` return it.
 
     Raises:
-        ValueError: not a world and a state; dt <= 0.
+        ValueError: not one world and its states; dt <= 0.
     """
     check_kinds(world, state)
     leading = shape_of_leaf(state.x, "state.x")[:-2]
@@ -128,6 +128,8 @@ def missed_pairs(world: World, state: State, dt: Any) -> Array:
 
     states = map_arrays(in_one_row, state, "state")
     check_leaves(world, states, batch_first=True)
+    if batch_rank(world):
+        raise ValueError("missed_pairs: world has a batch: expected one world and its states; pick one")
     world, states = floats(world, states)
     length = step_length(dt, states)
     if not world.crowd:

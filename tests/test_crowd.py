@@ -145,6 +145,8 @@ def test_what_has_no_room_is_counted(many):
         states = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
         assert_array_equal(dr.missed_pairs(world, states, 1 / 60), [missed, missed])
     assert dr.missed_pairs(*dr.scene({"a": bodies["d0"]}), 1 / 60) == 0
+    with pytest.raises(ValueError, match="world has a batch"):
+        dr.missed_pairs(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), world), states, 1 / 60)
 
 
 def test_large_scenes_list_no_pairs():

@@ -186,7 +186,10 @@ FORCES = {
         (*NUMBER, None),
     ),
     "Spring.a": (lambda v: forced(dr.SpringDamper(a=v, anchor_a=0.0, anchor_b=0.0, stiffness=1.0)), (*NAME, None)),
-    "Spring.b": (lambda v: forced(dr.SpringDamper(a="ball", b=v, anchor_a=0.0, anchor_b=0.0, stiffness=1.0)), NAME),
+    "Spring.b": (
+        lambda v: forced(dr.SpringDamper(a="ball", b=v, anchor_a=0.0, anchor_b=0.0, stiffness=1.0)),
+        (*NAME, "ball"),
+    ),
     "Spring.anchor_b": (
         lambda v: forced(dr.SpringDamper(a="ball", anchor_a=0.0, anchor_b=v, stiffness=1.0)),
         (*ODD, None),
