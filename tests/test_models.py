@@ -194,6 +194,18 @@ def test_shapes_that_share_a_name_are_all_there(write):
     assert world.static_names == ("tip_", "tip__", "upper_", "base_collision3")
 
 
+def test_equal_limits_are_those_of_a_weld(write):
+    """Both default to 0, as the parser of ROS has it."""
+    for limit in ("", '<limit effort="1"/>', '<limit lower="0.0" upper="0"/>'):
+        with pytest.warns(UserWarning, match="model.xml: left out: motion of joint 'shoulder', whose limits are equal"):
+            world, _ = dr.load_urdf(
+                write(ROBOT.replace('<limit lower="-1" upper="1.5" effort="1" velocity="1"/>', limit))
+            )
+        assert (
+            world.names == ("lower", "tool") and "upper_collision0" in world.static_names
+        )  # as its base does not move
+
+
 def test_a_floating_root_falls(write):
     text = ROBOT.replace(
         '<link name="base">',
@@ -243,6 +255,16 @@ def test_limits_of_a_hinge_may_lie_beyond_half_a_turn(write):
         write(mjcf('<body name="a"><joint name="j" range="-20 270"/><geom size="0.1" pos="1 0 0"/></body>'))
     )
     assert_allclose([read(world, state, f"j.{side}") for side in ("lower", "upper")], np.deg2rad([-20.0, 270.0]))
+
+
+@pytest.mark.parametrize("limits", ["0 0", "1 -1"])
+def test_a_range_that_is_none_is_no_limit(write, limits):
+    """As MuJoCo reads it, where `limited` is not given."""
+    body = mjcf(f'<body name="a"><joint name="j" range="{limits}"/><geom size="0.1" pos="1 0 0"/></body>')
+    (hinge,) = dr.load_mjcf(write(body))[0].joints
+    assert hinge.lower is None and hinge.upper is None
+    with pytest.raises(ValueError, match="expected lower < upper"):
+        dr.load_mjcf(write(body.replace("range", 'limited="true" range')))
 
 
 def test_a_mesh_weighs_nothing_beside_an_inertial(tmp_path):

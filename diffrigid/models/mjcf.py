@@ -287,7 +287,9 @@ def _driven(model: Model, reader: Reader, kind: str) -> Joint:
     lower = upper = None
     limited = reader.word("limited", "auto", "true", "false")
     if limited == "true" or limited == "auto" and model.limited and reader.given("range"):
-        lower, upper = (float(s) for s in scale * (reader.numbers("range", 2) - reader.number("ref", 0.0)))
+        ends = scale * (reader.numbers("range", 2) - reader.number("ref", 0.0))
+        if limited == "true" or ends[0] < ends[1]:
+            lower, upper = map(float, ends)
     reader.text("range")
     return Joint(
         kind, str(reader.text("name", "")), reader.numbers("pos", 3, np.zeros(3)),

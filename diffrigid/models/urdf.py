@@ -189,6 +189,9 @@ def _joint(where: str, element: ElementTree.Element, left_out: list[str]) -> Joi
     if kind in ("revolute", "prismatic"):
         lower, upper = limit.number("lower", 0.0), limit.number("upper", 0.0)
     left_out += limit.left_out("lower", "upper", "effort", "velocity")
+    if lower == upper == 0:
+        left_out.append(f"motion of joint {name!r}, whose limits are equal")
+        return Joint("weld", name)
     return Joint(
         KINDS[kind], name, axis=axis, lower=lower, upper=upper,
         damping=dynamics.number("damping", 0.0), friction=dynamics.number("friction", 0.0),
