@@ -1,5 +1,7 @@
 """Multiple shooting: a record of which a fit from start to end is lost is found in pieces, and ends as one motion."""
 
+import importlib
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -60,6 +62,16 @@ def test_what_is_not_measured_has_no_pieces():
     data = {"t": np.arange(9) / 8, "a.x": np.zeros((9, 2))}
     with pytest.raises(ValueError, match="no column 'b.x'"):
         sysid.fit_in_pieces(world, state, data, 3, free={"a.mass": dr.positive()})
+
+
+def test_a_component_of_the_initial_state_is_of_the_whole_record_too(monkeypatch):
+    """The pieces have their own velocities, so it is not free in these."""
+    given, module = [], importlib.import_module("diffrigid.sysid.segments")  # not the function of that name
+    monkeypatch.setattr(module, "fit", lambda *_, free, **options: given.append(free) or 1 / 0)
+    data = {"t": np.arange(9) / 8, "p.x": np.zeros((9, 2))}
+    with pytest.raises(ZeroDivisionError):
+        sysid.fit_in_pieces(*point(), data, 2, free={"gravity": dr.real(), "p.v[0]": dr.real()})
+    assert list(given[0]) == ["gravity", "p.x", "p.v"]
 
 
 @pytest.mark.parametrize("intervals", [sysid.sandwich, sysid.bootstrap])

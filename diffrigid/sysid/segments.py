@@ -138,7 +138,7 @@ def _initial(world: World, key: Any) -> bool:
     """Whether a path, or a tuple of paths, is part of the initial state."""
     names = [key] if isinstance(key, str) else key
     known = paths.catalogue(world)
-    return any(place.chain[0] == 1 for name in names for place in known.get(name, []))
+    return any(place.chain[0] == 1 for name in names for place in known.get(paths.component(name)[0], []))
 
 
 def _own_states(world: World, observations: Any) -> dict[str, Each]:
