@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from motions import DOWN, HEIGHT, IMPACT, MASS, RADIUS, E, G, T, bounce
+from motions import DOWN, HEIGHT, IMPACT, MASS, RADIUS, E, G, T, bounce, trajectory
 
 import diffrigid as dr
 from diffrigid import view
@@ -48,6 +48,21 @@ def test_phase_is_velocity_against_position(ax):
     falling = T < IMPACT
     curve = lines(view.phase(bounce(), "ball", "y", ax=ax))["ball"][falling]
     np.testing.assert_allclose(curve[:, 1] ** 2, 2 * G * (HEIGHT + RADIUS - curve[:, 0]), atol=1e-9)
+
+
+def test_phase_counts_the_turns_between_frames(ax):
+    curve = lines(view.phase(bounce(spin=250.0), "ball", "angle", ax=ax))["ball"]
+    np.testing.assert_allclose(curve[:, 0], 250.0 * T, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e3])
+def test_a_floor_is_drawn_as_far_as_the_picture_goes(ax, scale):
+    """Wherever the motion is, and in millimetres too."""
+    ball = dr.Body(dr.Disc(radius=0.1 * scale), mass=1.0, x=(100.0 * scale, scale))
+    made, start = dr.scene({"ball": ball, "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))})
+    run = trajectory(made, [0.0], *(leaf[None] for leaf in (start.x, start.q, start.v, start.w)))
+    (floor,) = (line.get_xydata() for line in view.strobe(run, ax=ax).get_lines() if line.get_color() == "0.4")
+    assert floor[:, 0].min() < ax.get_xlim()[0] and floor[:, 0].max() > ax.get_xlim()[1]
 
 
 def test_film_has_a_picture_for_every_thirtieth_of_a_second(tmp_path):

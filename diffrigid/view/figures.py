@@ -13,7 +13,7 @@ from diffrigid import state as of_state
 from diffrigid.convert import at_least_one, positive
 from diffrigid.touch import rotated
 from diffrigid.trajectory import Trajectory, checked
-from diffrigid.view.frames import energies
+from diffrigid.view.frames import energies, turns
 from diffrigid.view.outline import outline
 
 if TYPE_CHECKING:
@@ -29,10 +29,10 @@ def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
     world, pictures = checked(trajectory).world, at_least_one("pictures", pictures)
     if world.dim != 2:
         raise ValueError("strobe draws 2D motions: for 3D use play, or plot components of state.x")
-    (x, q), shapes, ax = _poses(trajectory), _outlines(world), _axes(ax)
+    (x, q), shapes, ax = _poses(trajectory), _outlines(world, range(len(world.names))), _axes(ax)
     rows = np.unique(np.rint(np.linspace(0, len(x) - 1, pictures)).astype(int))
     for owner, lines in shapes:
-        for n in rows if owner < len(world.names) else ():
+        for n in rows:
             shade = 0.25 + 0.75 * n / max(rows[-1], 1)
             ax.plot(*(x[n, owner] + rotated(q[n, owner], lines)).T, color=f"C{owner}", alpha=shade, linewidth=1.2)
     for body, name in enumerate(world.names):
@@ -55,16 +55,16 @@ def film(trajectory: Trajectory, path: str | Path, speed: float = 1.0, rate: int
     kinds: dict[str, Any] = {".gif": animation.PillowWriter, ".mp4": animation.FFMpegWriter}
     if path.suffix not in kinds or not kinds[path.suffix].isAvailable():
         raise ValueError(f"film: cannot write {path.name!r}: use .gif, which needs pillow, or .mp4, which needs ffmpeg")
-    (x, q), shapes, t = _poses(trajectory), _outlines(world), np.asarray(trajectory.t, float)
+    (x, q), t = _poses(trajectory), np.asarray(trajectory.t, float)
+    shapes = _outlines(world, range(len(world.names)))
     ax = figure.Figure().subplots()
     _stage(ax, world, x, shapes)
-    moving = [(owner, lines) for owner, lines in shapes if owner < len(world.names)]
-    curves = [ax.plot([], [], color=f"C{owner}")[0] for owner, _ in moving]
+    curves = [ax.plot([], [], color=f"C{owner}")[0] for owner, _ in shapes]
     writer = kinds[path.suffix](fps=rate)
     with writer.saving(ax.figure, path, dpi=100):
         for now in np.arange(t[0], t[-1] + 1e-9, speed / rate):
             n = int(np.abs(t - now).argmin())
-            for (owner, lines), curve in zip(moving, curves, strict=True):
+            for (owner, lines), curve in zip(shapes, curves, strict=True):
                 curve.set_data(*(x[n, owner] + rotated(q[n, owner], lines)).T)
             writer.grab_frame()
     return path
@@ -109,8 +109,8 @@ def phase(trajectory: Trajectory, body: str, axis: str = "x", ax: Any = None) ->
         raise ValueError(f"phase: no {axis!r} of {body!r}: bodies are {world.names}, axes {names}")
     k, row, ax = world.names.index(body), names.index(axis), _axes(ax)
     if axis == "angle":
-        q = np.asarray(state.q)[:, k]
-        ax.plot(np.unwrap(np.arctan2(q[:, 1], q[:, 0])), np.asarray(state.w)[:, k, 0], label=body)
+        w = np.asarray(state.w, float)
+        ax.plot(turns(np.asarray(trajectory.t, float), np.asarray(state.q, float), w)[:, k, 0], w[:, k, 0], label=body)
         return _labelled(ax, "angle [rad]", "angular velocity [rad/s]")
     ax.plot(np.asarray(state.x)[:, k, row], np.asarray(state.v)[:, k, row], label=body)
     return _labelled(ax, f"{axis} [m]", f"v_{axis} [m/s]")
@@ -120,29 +120,32 @@ def _poses(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(trajectory.state.x, float), np.asarray(trajectory.state.q, float)
 
 
-def _outlines(world: "World") -> list[tuple[int, np.ndarray]]:
-    """Collider and closed outline (P, 2) [m], about its centre, of every shape."""
+def _outlines(world: "World", colliders: range, reach: float = 0.0) -> list[tuple[int, np.ndarray]]:
+    """Collider and closed outline (P, 2) [m], about its centre, of every shape of these colliders."""
     found = []
     for group, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
         for row, owner in enumerate(owners):
-            lines = outline(jax.tree.map(lambda leaf, row=row: np.asarray(leaf)[row], group), 2)
+            if owner not in colliders:
+                continue
+            lines = outline(jax.tree.map(lambda leaf, row=row: np.asarray(leaf)[row], group), 2, reach=reach)
             found.append((owner, lines if offset is None else lines + np.asarray(offset.r[row])))
     return found
 
 
 def _stage(ax: Any, world: "World", x: np.ndarray, shapes: list) -> None:
-    """Draw the statics, and set limits that contain the whole motion."""
-    moving, pad = len(world.names), 0.0
-    for owner, lines in shapes:
-        if owner < moving:
-            pad = max(pad, 1.1 * float(np.linalg.norm(lines, axis=1).max()))
-            continue
-        still_x, still_q = (np.asarray(leaf, float)[owner - moving] for leaf in (world.statics.x, world.statics.q))
-        ax.plot(*(still_x + rotated(still_q, lines)).T, color="0.4", linewidth=1.2)
+    """Draw the statics, and set limits that contain the whole motion of bodies with these outlines."""
+    pad = max((1.1 * float(np.linalg.norm(lines, axis=1).max()) for _, lines in shapes), default=0.0)
     low, high = np.nanmin(x, axis=(0, 1)) - pad, np.nanmax(x, axis=(0, 1)) + pad
     pad = 0.05 * float((high - low).max())
-    ax.set_xlim(low[0] - pad, high[0] + pad)
-    ax.set_ylim(low[1] - pad, high[1] + pad)
+    low, high = low - pad, high + pad
+    still_x, still_q = (np.asarray(leaf, float) for leaf in (world.statics.x, world.statics.q))
+    corners, moving = np.maximum(np.abs(low - still_x), np.abs(high - still_x)), len(world.names)  # the farthest
+    reach = float(np.linalg.norm(corners, axis=1).max(initial=0.0))
+    for owner, lines in _outlines(world, range(moving, moving + len(still_x)), reach):
+        x, q = still_x[owner - moving], still_q[owner - moving]
+        ax.plot(*(x + rotated(q, lines)).T, color="0.4", linewidth=1.2)
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(low[1], high[1])
     ax.set_aspect("equal")
 
 

@@ -77,7 +77,7 @@ def record(
 def poses(trajectory: Trajectory) -> np.ndarray:
     """Columns of every body, in 2D x, y, angle, vx, vy, in 3D x, y, z, q (4), v (3); [m], [rad], [m/s]."""
     x, q, v, w = (np.asarray(getattr(trajectory.state, name), float) for name in "xqvw")
-    turn = _turns(np.asarray(trajectory.t, float), q, w) if x.shape[2] == 2 else _near(q)
+    turn = turns(np.asarray(trajectory.t, float), q, w) if x.shape[2] == 2 else _near(q)
     return np.concatenate([x, turn, v], axis=2).reshape(len(x), -1)
 
 
@@ -87,7 +87,7 @@ def contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
     return np.column_stack([found.t, found.impact, found.point, found.impulse])
 
 
-def _turns(t: np.ndarray, q: np.ndarray, w: np.ndarray) -> np.ndarray:
+def turns(t: np.ndarray, q: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Angles (T, N, 1), unwrapped by means of the angular velocities, however fast."""
     angle = np.arctan2(q[:, :, 1:], q[:, :, :1])
     expected = np.diff(t)[:, None, None] * (w[1:] + w[:-1]) / 2

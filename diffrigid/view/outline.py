@@ -4,19 +4,19 @@ import numpy as np
 
 from diffrigid.shapes import Capsule, Disc, HalfSpace, HeightField, Profile, Shape, Sphere, edges, vertices
 
-REACH = 50.0  # [m] half width of a drawn half space
+REACH = 50.0  # [m] half width of a half space where it is not said how far it is seen
 
 
-def outline(shape: Shape, dim: int, points: int = 48):
+def outline(shape: Shape, dim: int, points: int = 48, reach: float = REACH):
     """Lines that draw a shape, NumPy: in 2D one closed polyline (P, 2) [m], in 3D a list of polylines (P_i, 3) [m].
 
-    Round parts have about `points` points a turn. A half space is a long segment (2, 2), or a large square;
-    a profile is its line between its ends, a height field the lines of its grid.
+    Round parts have about `points` points a turn. A half space is a segment (2, 2), or a square, that goes
+    `reach` [m] to each side; a profile is its line between its ends, a height field the lines of its grid.
     """
-    return _outline_2d(shape, points) if dim == 2 else _outline_3d(shape, points)
+    return _outline_2d(shape, points, reach) if dim == 2 else _outline_3d(shape, points, reach)
 
 
-def _outline_2d(shape, points):
+def _outline_2d(shape, points, reach):
     match shape:
         case Disc():
             return _circle(float(shape.radius), points)
@@ -25,13 +25,13 @@ def _outline_2d(shape, points):
         case HalfSpace():
             normal = np.asarray(shape.normal)
             along = np.array([-normal[1], normal[0]])
-            return float(shape.offset) * normal + REACH * np.stack([along, -along])
+            return float(shape.offset) * normal + reach * np.stack([along, -along])
         case Profile():
             return np.asarray(shape.points)
     return _closed(np.asarray(vertices(shape, 2)))
 
 
-def _outline_3d(shape, points):
+def _outline_3d(shape, points, reach):
     match shape:
         case Sphere():
             return [_raised(_circle(float(shape.radius), points), axes) for axes in ((0, 1), (1, 2), (2, 0))]
@@ -41,7 +41,7 @@ def _outline_3d(shape, points):
             normal = np.asarray(shape.normal)
             across = np.linalg.svd(normal[None])[2][1:]  # two unit vectors that span the surface
             square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
-            return [float(shape.offset) * normal + REACH * square @ across]
+            return [float(shape.offset) * normal + reach * square @ across]
         case HeightField():
             grid = nodes(shape)
             return [*grid, *grid.swapaxes(0, 1)]
