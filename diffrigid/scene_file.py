@@ -24,6 +24,7 @@ restitution = { interval = [0, 1] }
 [observe]                                   # columns that are not named for what they observe
 tip = { marker = { body = "ball", point = [0.1, 0.0] } }
 pixels = { homography = { of = "ball", matrix = [[...], [...], [...]] } }
+note = false                                # left out, whatever it holds
 
 [columns]                                   # columns of the files, where they have other names or units; no others
 t = { time = 0.001 }                        # "time" in ms
@@ -117,7 +118,10 @@ def read_scene(path: str | Path) -> SceneFile:
         world=world,
         state=state,
         free={_paths(key): _kind(f"{path}: free.{key}", entry) for key, entry in data.get("free", {}).items()},
-        observe={k: _observer(f"{path}: observe.{k}", entry) for k, entry in data.get("observe", {}).items()},
+        observe={
+            k: None if entry is False else _observer(f"{path}: observe.{k}", entry)
+            for k, entry in data.get("observe", {}).items()
+        },
         columns={k: _column(f"{path}: columns.{k}", entry) for k, entry in data.get("columns", {}).items()},
         options=_options(f"{path}: fit", data.get("fit", {})),
     )

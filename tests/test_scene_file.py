@@ -47,6 +47,7 @@ restitution = { interval = [0, 1] }
 
 [observe]
 tip = { marker = { body = "b", point = [0.1, 0.0] } }
+note = false
 far = { separation = { a = "a", b = { marker = { body = "b" } } } }
 
 [fit]
@@ -78,7 +79,7 @@ def test_a_scene_file_is_the_scene_it_describes(tmp_path):
     }  # fmt: skip
     assert found.free == free and found.options == {"starts": 2, "loss": dr.student(3.0)}
     assert found.observe == {
-        "tip": dr.Marker("b", point=[0.1, 0.0]), "far": dr.Separation("a", dr.Marker("b")),
+        "tip": dr.Marker("b", point=[0.1, 0.0]), "note": None, "far": dr.Separation("a", dr.Marker("b")),
     }  # fmt: skip
 
 
@@ -115,8 +116,8 @@ def test_fit_from_the_command_line(tmp_path):
         'gravity = [0.0, -9.0]\n[bodies.p]\nmass = 1.0\ninertia = 1.0\nx = [0.0, 1.0]\n[free]\n"gravity" = "real"\n'
         '[columns]\nt = { time = 0.001 }\n"p.x[0]" = "x"\n"p.x[1]" = "p.x[1]"\n'
     )
-    lines = [f"{1e3 * t:.3f},0.0,{1 - 9.81 * t**2 / 2:.9f},7" for t in np.arange(12) / 20]
-    (tmp_path / "fall.csv").write_text("\n".join(["time,x,p.x[1],frame", *lines]) + "\n")
+    lines = [f"{1e3 * t:.3f},0.0,{1 - 9.81 * t**2 / 2:.9f},free" for t in np.arange(12) / 20]
+    (tmp_path / "fall.csv").write_text("\n".join(["time,x,p.x[1],note", *lines]) + "\n")
     files, said = [str(tmp_path / name) for name in ("scene.toml", "fall.csv")], io.StringIO()
     with contextlib.redirect_stdout(said):
         assert main(["fit", *files, "--out", str(tmp_path / "fit.json"), "--report", str(tmp_path / "fit.html")]) == 0
@@ -130,4 +131,4 @@ def test_fit_from_the_command_line(tmp_path):
     (tmp_path / "other.csv").write_text("times,x,p.x[1]\n0,0,0\n1,0,0\n")
     with pytest.raises(SystemExit), contextlib.redirect_stderr(said):
         main(["fit", files[0], str(tmp_path / "other.csv")])
-    assert "has no column 'time', which is 't' here: did you mean 'times'?" in said.getvalue()
+    assert "has no column 'time': did you mean 'times'?" in said.getvalue()

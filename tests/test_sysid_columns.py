@@ -3,6 +3,7 @@
 import dataclasses
 import re
 import textwrap
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.columns import columns, read_csv
 from diffrigid.sysid.parameters import channel_paths
 from diffrigid.sysid.sensors import difference, predict
+from diffrigid.sysid.setup import make_problem
 
 WORLD, STATE = dr.scene(
     {
@@ -193,6 +195,9 @@ def test_a_file_as_spreadsheets_write_it(tmp_path):
     (tmp_path / "lost.csv").write_text("# a remark\nt,cue.x[0]\n\n0,1\n1,lost\n")
     with pytest.raises(ValueError, match=r"lost.csv, line 5, column 'cue.x\[0\]' is 'lost': expected numbers"):
         read_csv(tmp_path / "lost.csv")
+    (tmp_path / "number.csv").write_text("t,cue.x[0]\n0,1_5\n")
+    with pytest.raises(ValueError, match=r"line 2, column 'cue.x\[0\]' is '1_5': expected numbers"):
+        read_csv(tmp_path / "number.csv")
     (tmp_path / "twice.csv").write_text("t,cue.x[0],note,cue.x[0],note\n0,1,a,2,b\n")
     with pytest.raises(ValueError, match=r"two columns have the name 'cue.x\[0\]'"):
         read_csv(tmp_path / "twice.csv", ["note"])
@@ -209,6 +214,19 @@ def test_columns_that_are_none_of_the_fit_are_left_out(tmp_path):
     assert np.isnan(x.values[:, 1]).all()
     with pytest.raises(ValueError, match="no column 'gate' in this 2D world.*None leaves it out"):
         columns(WORLD, {"t": T, "gate": T}, {})
+
+
+def test_velocities_in_another_unit_are_doubted_and_fast_vibrations_fitted():
+    """Of several records the first is named. A spring of 10 Hz filmed at 9.7 Hz moves faster than its rows."""
+    data = {"t": T, "cue.x": np.outer(T, (3.0, 0.0)), "cue.v": np.full((6, 2), 3000.0)}
+    problem = partial(make_problem, WORLD, STATE, free={"cue.v": dr.real()})
+    with pytest.warns(UserWarning, match=r"observations\[1\]\['cue.v'\]: speeds of .* metres and seconds\?") as caught:
+        problem([GOOD, data, data])
+    assert len(caught) == 1
+    t, w = np.arange(20) / 9.7, 2 * np.pi * 10.0
+    x, v = (np.outer(wave, (1.0, 0.0)) for wave in (0.1 * np.sin(w * t), 0.1 * w * np.cos(w * t)))
+    with pytest.warns(UserWarning, match="a motion faster than its rows"):
+        problem({"t": t, "cue.x": x, "cue.v": v})
 
 
 def test_columns_may_have_times_of_their_own():
@@ -239,7 +257,6 @@ GOOD = {"t": T, "cue.x": np.zeros((6, 2))}
             for name in ("ball.x1", "ball.x_1", "ball.y", "ball.xy")
         ),
         (GOOD | {"ball.x": np.full((6, 2), np.nan)}, {}, "every value is NaN"),
-        ({"t": T, "cue.x": np.outer(T, (3.0, 0.0)), "cue.v": np.full((6, 2), 3000.0)}, {}, "metres and seconds"),
         ({"t": T}, {}, "nothing is measured"),
         ([], {}, "empty list"),
         (5.0, {}, "expected a dict, a table or the path"),

@@ -1,7 +1,7 @@
 """Measured columns by name, from a dictionary, a table or a CSV file, checked."""
 
 import csv
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid.controls import controlled
+from diffrigid.convert import nearest
 from diffrigid.paths import component
 from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.sensors import Channel, Part
@@ -66,14 +67,15 @@ def columns(
         raise ValueError(f"observe: no column {sorted(unused)[0]!r} in {where}, there are {sorted(gathered)}")
     if not found:
         raise ValueError(f"{where}: nothing is measured: expected a column beside the times")
-    _refuse_units(found, channels, where)
     return tuple(found), channels, tuple(controls)
 
 
-def read_csv(path: str | Path, left_out: Collection[str] = ()) -> dict[str, np.ndarray]:
+def read_csv(
+    path: str | Path, left_out: Collection[str] = (), only: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
     """Read the columns of a file with one line of names; an empty cell is a missing value.
 
-    Those that are `left_out` may hold anything.
+    Those that are `left_out`, and with `only` all others than these, may hold anything.
 
     Between columns are commas, or semicolons or tabs where the names have these; numbers may then have decimal commas.
     """
@@ -91,18 +93,20 @@ def read_csv(path: str | Path, left_out: Collection[str] = ()) -> dict[str, np.n
     if not rows:
         raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
     names, body = [name.strip() for name in rows[0][1]], [row for _, row in rows[1:]]
-    kept = [k for k, name in enumerate(names) if name not in left_out]
+    if lost := sorted(set(only or ()) - set(names)):
+        raise ValueError(f"{path} has no column {lost[0]!r}: {nearest(lost[0], names)}")
+    kept = [k for k, name in enumerate(names) if name not in left_out and (only is None or name in only)]
     if twice := [names[k] for k in kept if names[k] in names[:k]]:
         raise ValueError(f"{path}: two columns have the name {twice[0]!r}: rename one, or leave it out")
     for number, row in rows[1:]:
         if len(row) != len(names):
             raise ValueError(f"{path}, line {number}: {len(row)} cells, expected {len(names)}, one for each name")
-        for name, cell in zip(names, row, strict=True):
-            wanted = name not in left_out and cell.strip()
-            if wanted and not _is_number(cell.replace(",", ".") if mark != "," else cell):
+        for k in kept:
+            cell = row[k].replace(",", ".") if mark != "," else row[k]
+            if cell.strip() and not _is_number(cell):
                 raise ValueError(
-                    f"{path}, line {number}, column {name!r} is {cell!r}: expected numbers under one line of names, "
-                    "empty where missing"
+                    f"{path}, line {number}, column {names[k]!r} is {row[k]!r}: expected numbers under one line of "
+                    "names, empty where missing"
                 )
     if mark != ",":
         body = [[cell.replace(",", ".") for cell in row] for row in body]
@@ -170,7 +174,7 @@ def _is_number(cell: str) -> bool:
         float(cell)
     except ValueError:
         return False
-    return True
+    return "_" not in cell  # which Python takes
 
 
 def check_mapping(where: str, value: Any) -> None:
@@ -227,8 +231,8 @@ def _filled(values: Any, rows: int, size: int, name: str, where: str, world: Wor
     return values
 
 
-def _refuse_units(found: list[Series], channels: Mapping[str, Channel], where: str) -> None:
-    """Raise ValueError for velocities far from the slopes of the body's positions: they have another unit."""
+def odd_speeds(found: Sequence[Series], channels: Mapping[str, Channel]) -> str:
+    """Say which velocities are far from the slopes of the body's positions, as in another unit; "" if none are."""
     parts = {(c.observer.body, c.observer.field): name for name, c in channels.items() if isinstance(c.observer, Part)}
     by_name = {s.name: s for s in found}
     for (body, field), name in parts.items():
@@ -238,10 +242,11 @@ def _refuse_units(found: list[Series], channels: Mapping[str, Channel], where: s
             near, far = (_median_size(_slopes(x, lag)) for lag in (1, max(len(x.t) // 10, 1)))
             speeds = _median_size(v.values)
             if near > 0 and speeds > 0 and (speeds > UNLIKE * near or UNLIKE * speeds < min(near, far)):
-                raise ValueError(
-                    f"{where}[{name!r}]: speeds of about {speeds:.3g}, but {parts[body, 'x']!r} moves at {far:.3g} a "
-                    "second: are both in metres and seconds?"
+                return (
+                    f"[{name!r}]: speeds of about {speeds:.3g}, but {parts[body, 'x']!r} moves at {far:.3g} a second: "
+                    "are both in metres and seconds? If so, it is a motion faster than its rows show"
                 )
+    return ""
 
 
 def _slopes(series: Series, lag: int) -> np.ndarray:

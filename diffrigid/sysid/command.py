@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from diffrigid import scene_file
-from diffrigid.convert import nearest
 from diffrigid.sysid.columns import read_csv
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.summary import load_fit
@@ -47,8 +46,5 @@ def _record(path: str, columns: Mapping[str, tuple[str, float]]) -> Any:
     """A file, or those of its columns that are named, by their names here."""
     if not columns:
         return path
-    table = read_csv(path)
-    for ours, (theirs, _) in columns.items():
-        if theirs not in table:
-            raise ValueError(f"{path} has no column {theirs!r}, which is {ours!r} here: {nearest(theirs, table)}")
+    table = read_csv(path, only=[theirs for theirs, _ in columns.values()])
     return {ours: factor * table[theirs] for ours, (theirs, factor) in columns.items()}

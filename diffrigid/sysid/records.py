@@ -1,5 +1,6 @@
 """Measured records: columns with the scene, the start and the noise that belong to them, checked."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from diffrigid.controls import controlled
 from diffrigid.convert import known_number
 from diffrigid.state import State
-from diffrigid.sysid.columns import Series, check_mapping, columns
+from diffrigid.sysid.columns import Series, check_mapping, columns, odd_speeds
 from diffrigid.sysid.sensors import Channel
 from diffrigid.tables import moment
 from diffrigid.world import World, check
@@ -76,10 +77,13 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
     records = [r if isinstance(r, Record) else Record(r) for r in (observations if several else [observations])]
     if not records:
         raise ValueError("observations is an empty list: expected at least one record")
+    where = [f"observations[{index}]" if several else "observations" for index in range(len(records))]
     found = [
-        _run(world, state, record, observe, noise or {}, f"observations[{index}]" if several else "observations")
-        for index, record in enumerate(records)
+        _run(world, state, record, observe, noise or {}, part) for record, part in zip(records, where, strict=True)
     ]
+    odd = [odd_speeds(run.series, run.channels) for run in found]
+    if any(odd):
+        warnings.warn(next(part + text for part, text in zip(where, odd, strict=True) if text), stacklevel=4)
     everywhere = sorted({s.name for run in found for s in run.series})
     if unknown := set(noise or {}) - set(everywhere):
         raise ValueError(f"noise: no column {sorted(unknown)[0]!r} in observations, there are {everywhere}")
