@@ -511,6 +511,18 @@ def test_design_for_one_of_several_numbers():
             plan(**{few: 0})
 
 
+def test_design_varies_what_is_of_the_world_and_what_is_free_itself():
+    """A weak damping tells most of a spring, and the farthest start does, known or not."""
+    free = {"spring.stiffness": dr.positive(), "p.x": dr.prior(dr.real(), 0.0, 1e-3)}
+    found = sysid.best_launch(
+        *spring(4.0), {"t": np.arange(30) / 15, "p.x": None}, free=free, noise={"p.x": 1e-3}, starts=2, steps=10,
+        vary={"p.x": dr.each(dr.interval(-2, 2)), "spring.damping": dr.interval(0, 1)}, target="spring.stiffness",
+    )  # fmt: skip
+    assert (np.abs(found.values["p.x"]) > 1.7).all() and found.values["spring.damping"] < 0.1
+    width = np.log(found.parameters[0].high / found.parameters[0].low)
+    assert_allclose(found.score, np.log(width / (2 * 1.959964)), rtol=1e-6)
+
+
 def test_a_jump_of_the_cost_beside_the_best_fit_is_noticed(fit, monkeypatch):
     """Residuals leap by 5 deviations as soon as the numbers go where the slopes say that the cost falls."""
     at = Numbers(jnp.asarray(fit.shared)[:, None], jnp.asarray(fit.own)[..., None])

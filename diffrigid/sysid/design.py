@@ -16,6 +16,7 @@ from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.columns import as_floats, as_times, check_mapping
 from diffrigid.sysid.covariance import Linear, from_jacobian
 from diffrigid.sysid.diagnosis import Coordinate, blind_directions, infinite_where_blind
+from diffrigid.sysid.free import Each, each
 from diffrigid.sysid.intervals import coordinates_of, interval_of, unit_of, unseen_of
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
@@ -78,7 +79,7 @@ def expected_intervals(
         >>> round(float(told.high - told.low), 3)  # [N/m]
         0.039
     """
-    problem = _problem(world, state, [state], planned, free, noise, observe, dt)
+    problem = _problem([(world, state)], planned, free, noise, observe, dt)
     linear, (z, _), out = _linear(problem), first_numbers(problem), []
     uncertainty, blind = from_jacobian(linear), blind_directions(linear, coordinates_of(problem))
     for slot, rows in pieces(problem.shared):
@@ -116,7 +117,8 @@ def best_launch(
     """The launch whose record would give the narrowest intervals, by gradients from several starts.
 
     Args:
-        vary: what can be chosen of the initial state, as `free`: {"ball.v": interval(-3, 3)}.
+        vary: what can be chosen of the initial state or the world, as `free`: {"ball.v": interval(-3, 3)}. What is
+            free too, as the velocity of a launch by hand, is chosen, but not known.
         target: the one of `free` to learn, while the others are unknown too; default all of them (D-optimal).
         starts: the first is the launch of `state`, the others are random.
         steps: along the gradient, of each start.
@@ -128,11 +130,13 @@ def best_launch(
         ValueError: the target is not free; starts or steps < 1; what `expected_intervals` does not take.
     """
     starts, steps = at_least_one("starts", starts), at_least_one("steps", steps)
-    plan = partial(_problem, world, state, planned=planned, free=free, noise=noise, observe=observe, dt=dt)
-    scene = scene_of(plan([state]).runs[0])
-    slots, _ = make_slots(vary, [scene])
+    plan = partial(_problem, planned=planned, noise=noise, observe=observe, dt=dt)
+    first_launch = plan([(world, state)], free=free)
+    scene, shared, rows = scene_of(first_launch.runs[0]), first_launch.sizes[0], _rows_of(first_launch, target)
+    slots = [slot for some in make_slots(vary, [scene]) for slot in some]
     about = [np.asarray(reference(slot, scene)) for slot in slots]
-    rows = _rows_of(plan([state]), target)
+    of_each = sorted(free.items(), key=lambda item: isinstance(item[1], Each))  # launches share nothing
+    own = {key: kind if isinstance(kind, Each) else each(kind) for key, kind in of_each}
     count, random = sum(slot.size for slot in slots), np.random.default_rng(seed)
 
     def launched(u: np.ndarray) -> Scene:
@@ -142,9 +146,9 @@ def best_launch(
         """Scores of launches u (starts, count), and their gradients."""
         shifts = np.concatenate([np.zeros((1, count)), NUDGE * np.eye(count), -NUDGE * np.eye(count)])
         points = (u[:, None] + shifts[None]).reshape(-1, count)
-        problem = plan([launched(point).state for point in points])
+        problem = plan([launched(point)[:2] for point in points], free=own)
         places = coordinates_of(problem)
-        value = np.array([_score(linear, places, rows) for linear in _linears(problem)]).reshape(starts, -1)
+        value = np.array([_score(linear, places, rows) for linear in _linears(problem, shared)]).reshape(starts, -1)
         return value[:, 0], (value[:, 1 : count + 1] - value[:, count + 1 :]) / (2 * NUDGE)
 
     drawn = [[slot.kind.draw(a, random) for slot, a in zip(slots, about, strict=True)] for _ in range(starts - 1)]
@@ -170,7 +174,9 @@ def _descended(scores: Callable, u: np.ndarray, steps: int) -> tuple[np.ndarray,
     return u[np.argmin(value)], float(value.min())
 
 
-def _problem(world: World, state: State, states: Sequence[State], planned, free, noise, observe, dt) -> Problem:
+def _problem(scenes: Sequence[tuple[World, State]], planned, free, noise, observe, dt) -> Problem:
+    """The problem of planned records, one of each scene."""
+    world, state = scenes[0]
     check(world, state)
     for where, given in (("planned", planned), ("noise", noise), ("observe", observe)):
         check_mapping(where, given)
@@ -188,7 +194,7 @@ def _problem(world: World, state: State, states: Sequence[State], planned, free,
             kept.add(whole)
     gone = set(wholes.values()) - kept
     noise, observe = ({name: v for name, v in given.items() if name not in gone} for given in (noise or {}, observe))
-    records = [Record(columns, state=s) for s in states]
+    records = [Record(columns, state=s, world=w) for w, s in scenes]
     return make_problem(world, state, records, free=free, noise=noise, observe=observe, dt=dt)
 
 
@@ -210,11 +216,11 @@ def _linear(problem: Problem) -> Linear:
     return linear_of(problem, point_at(problem.groups, make_starts(problem, 1, 0)), 0, Squares(), False)
 
 
-def _linears(problem: Problem) -> list[Linear]:
-    """Linearisation of each record alone."""
+def _linears(problem: Problem, shared: int) -> list[Linear]:
+    """Linearisation of each record alone, the first numbers of which count as shared."""
     linear = _linear(problem)
     rows = zip(linear.rows, linear.slopes, linear.times, strict=True)
-    return [Linear((r,), (J,), (t,), linear.shared, 1.0, False) for r, J, t in rows]
+    return [Linear((r,), (J,), (t,), shared, 1.0, False) for r, J, t in rows]
 
 
 def _rows_of(problem: Problem, target: str | None) -> slice:
