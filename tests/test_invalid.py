@@ -329,8 +329,6 @@ FITS = {
     "profile fit": (lambda v: dr.profile(v, "ball.v"), (*RECORD, None)),
     "sample fit": (dr.sample, (*RECORD, None)),
     "jumps fit": (dr.sysid.jumps, (*RECORD, None)),
-    "residual_figure fit": (dr.sysid.residual_figure, (*RECORD, None)),
-    "correlation_figure fit": (dr.sysid.correlation_figure, (*RECORD, None)),
     "CSV": (lambda v: fitted(observations=v), ("nowhere.csv", "", ".", Path("nowhere"), "\udd00")),
     "load_scene": (dr.load_scene, ("nowhere.json", None, 1.5, 0, "", ".", object(), {}, [])),
     "read_scene": (read_scene, ("nowhere.toml", None, 1.5, 10**6, "", ".", object(), {}, [])),

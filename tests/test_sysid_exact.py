@@ -295,7 +295,7 @@ def test_a_saved_fit_is_read_back_and_resumed(fit, records, tmp_path):
     assert {"diffrigid", "jax", "numpy"} <= set(json.loads((tmp_path / "fit.json").read_text())["versions"])
     again = dr.fit(*point(), records, free=FREE, progress=False, resume=saved, iterations=1)
     assert_allclose(again["p.x"].value, fit["p.x"].value, atol=1e-6)
-    for use in (lambda fit: dr.profile(fit, "gravity"), dr.sample, sysid.jumps, sysid.residual_figure):
+    for use in (lambda fit: dr.profile(fit, "gravity"), dr.sample, sysid.jumps):
         with pytest.raises(ValueError, match=r"expected a Fit; what load_fit read is its table only: dr.fit\("):
             use(saved)
     (tmp_path / "other.json").write_text("{}")
@@ -584,17 +584,6 @@ def test_values_that_fit_as_well_beyond_another_valley_are_in_the_note_of_a_prof
     rise = np.array([0.3, 2.0, 0.0, 2.0, 2.5])
     found = ProfileLikelihood("k", np.arange(5.0), rise, 1.9, 1.2, 2.8)
     assert found.apart == [0.0] and found.note == "profile, 0 fits as well"
-
-
-def test_figures_show_residuals_costs_correlations_and_profiles(fit):
-    pytest.importorskip("matplotlib")
-    axes = sysid.residual_figure(fit, record=2).axes[0]
-    drawn = [line.get_ydata() for line in axes.lines if line.get_label().startswith("p.x")]
-    assert_allclose(np.stack(drawn, axis=1), fit.residuals[2]["p.x"][: len(drawn[0])])
-    assert sysid.cost_figure(fit).axes[0].lines[0].get_ydata() == fit.costs
-    assert_allclose(sysid.correlation_figure(fit).axes[0].images[0].get_array(), fit.correlation)
-    found = ProfileLikelihood("k", np.arange(3.0), np.array([1.0, 0.0, 1.0]), 0.5, 0.3, 1.7)
-    assert_allclose(sysid.profile_figure(found).axes[0].lines[0].get_ydata(), found.rise)
 
 
 def test_a_late_clock_is_felt_across_an_impact():

@@ -7,7 +7,7 @@ To read it, in the order of a fit; `fit.py` runs it:
     the problem           setup.py, first_rows.py, problem.py (from z to residuals), clocks.py, points.py (back)
     solvers               levenberg.py, gradient.py; segments.py for long records
     how sure              covariance.py, profile.py, sampling.py, diagnosis.py, remarks.py, orders.py
-    what comes out        result.py, intervals.py, summary.py, table.py, figures.py
+    what comes out        result.py, intervals.py, summary.py, table.py
     before measuring      design.py
 
 Letters of array axes: K rows of a column, M numbers of a column, R records, S starts, a shared numbers z, b numbers z
@@ -17,7 +17,6 @@ of each record, m residuals.
 from diffrigid.sysid.charts import direction, inertia, rotation, shares
 from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
 from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
-from diffrigid.sysid.figures import correlation_figure, cost_figure, profile_figure, residual_figure
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import each, interval, positive, prior, real
 from diffrigid.sysid.gradient import first_order, lbfgs
@@ -43,8 +42,6 @@ __all__ = [
     "best_launch",
     "blind_spots",
     "bootstrap",
-    "correlation_figure",
-    "cost_figure",
     "direction",
     "each",
     "expected_intervals",
@@ -63,9 +60,7 @@ __all__ = [
     "positive",
     "prior",
     "profile",
-    "profile_figure",
     "real",
-    "residual_figure",
     "residual_vector",
     "rotation",
     "sample",
