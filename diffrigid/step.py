@@ -173,19 +173,19 @@ def _given_substeps(substeps: Any, intervals: int) -> tuple[int, ...]:
     return counts
 
 
-def _intervals(times: Any, dtype: Any) -> tuple[Any, Array]:
+def _intervals(times: Any, dtype: Any) -> tuple[Any, Numbers]:
     """Times (T+1,) and intervals [s], the former in double precision where known, for a clock that began long ago."""
     t = numbers("times", times, None)
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"times has shape {t.shape}, expected (T+1,) with T >= 1")
-    between = jnp.asarray(jnp.diff(t) if traced(t) else np.diff(np.asarray(times, float)), dtype)
+    between = jnp.diff(t).astype(dtype) if traced(t) else np.diff(np.asarray(times, float)).astype(dtype)
     gaps = _concrete(between)
     if gaps is not None and not (gaps > 0).all():
         raise ValueError(f"times must increase, got steps of {gaps.min():g} s or NaN: sort them and drop repeats")
     return t if traced(t) else np.asarray(times, float), between
 
 
-def _substeps(intervals: Array, longest: Array) -> tuple[int, ...]:
+def _substeps(intervals: Numbers, longest: Numbers) -> tuple[int, ...]:
     """Number of steps of each interval."""
     gaps, most = _concrete(intervals), _concrete(longest)
     if gaps is None or most is None:
@@ -193,8 +193,10 @@ def _substeps(intervals: Array, longest: Array) -> tuple[int, ...]:
     return tuple(steps_in(gaps, most).tolist())
 
 
-def _concrete(value: Array) -> np.ndarray | None:
+def _concrete(value: Numbers) -> np.ndarray | None:
     """The numbers of an array, which it has under `jax.grad`; None: it is traced by jit or vmap."""
+    if not traced(value):
+        return np.asarray(value)  # within jit, JAX would trace it
     try:
         return np.asarray(lax.stop_gradient(value))
     except jax.errors.TracerArrayConversionError:
