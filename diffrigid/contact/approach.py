@@ -34,6 +34,7 @@ class Task(NamedTuple):
     size: Array  # (*batch) [m] the smaller reach
     slow: Array  # (*batch) [m/s] contacts that close no faster rest
     width: Array | None  # (*batch) [m] None: exact
+    rested: Array  # (*batch) bool: a contact of the two rested before, in this step
 
     @property
     def span(self) -> Array:
@@ -46,9 +47,9 @@ class Task(NamedTuple):
         return jnp.sqrt(jnp.finfo(self.t1.dtype).eps)
 
 
-def task_of(a: Side, b: Side, t1: Array, width: Array | None, slow: Array) -> Task:
+def task_of(a: Side, b: Side, t1: Array, width: Array | None, slow: Array, rested: Array) -> Task:
     """Make the task, without derivatives: else a search loop would carry tangents in vain."""
-    task = Task(a, b, earliest(a, b)[0], t1, jnp.minimum(reach_of(a), reach_of(b)), slow, width)
+    task = Task(a, b, earliest(a, b)[0], t1, jnp.minimum(reach_of(a), reach_of(b)), slow, width, rested)
     return lax.stop_gradient(task)
 
 
@@ -71,15 +72,16 @@ def touches(gap: Array, v: Array, acc: Array, near: Array, slow: Array) -> Array
 def resting(task: Task, gaps: Gaps) -> Array:
     """Whether contacts rest, (K, *batch) bool: they touch, or are about to, and close slowly.
 
-    If one contact of the pair rests, so do all that are slow enough to come to rest anyway. Else, in a free flight
-    without support, they would be found to close first, and hide the fast impact of another corner.
+    If one contact of the pair rests, or rested before an impact with another body within the step, so do all that are
+    slow enough to come to rest anyway. Else, in a free flight without support, they would be found to close first, and
+    hide the fast impact of another corner.
     """
     gap, v, acc, *_ = gaps
     near, slow = (NEAR * task.size)[None], task.slow[None]
     touching = touches(gap, v, acc, near, slow)
     # A contact that closes at a third of the speed of its fall would be back within the step, whatever e <= 1.
     least = slow + jnp.maximum(-acc, 0.0) * jnp.maximum(task.span, 0.0)[None] / 3.0
-    return touching | (touches(gap, v, acc, near, least) & touching.any(0)[None])
+    return touching | (touches(gap, v, acc, near, least) & (touching.any(0) | task.rested)[None])
 
 
 def taking_over(task: Task, gaps: Gaps, rests: Array) -> Array:

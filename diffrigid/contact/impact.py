@@ -46,7 +46,7 @@ AT_ONCE = 1e-8  # [-] of the smaller size: contacts whose gaps differ by no more
 
 
 def find_impact(
-    a: Side, b: Side, t1: Array, width: Array | None, straight: bool, rest_speed: Array, at_end: Array
+    a: Side, b: Side, t1: Array, width: Array | None, straight: bool, rest_speed: Array, rested: Array, at_end: Array
 ) -> Meeting:
     """First impact of one pair before t1, or the end of the step itself.
 
@@ -55,6 +55,7 @@ def find_impact(
         width: (*batch) [m] smoothing width of the distance; 0 is exact. None: exact, known when tracing.
         straight: all bodies have the same acceleration, so relative paths are straight lines.
         rest_speed: (*batch) [m/s] the times of slower impacts have no derivative.
+        rested: (*batch) bool: a contact of the two rested before, in this step.
         at_end: bool; True: do not look for an impact, s is t1.
 
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
@@ -65,7 +66,7 @@ def find_impact(
         s0, level, found, _ = unfused(live, approach, a, b, width)
         rests = round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
     else:
-        s0, level, found, rests = approach_search(a, b, t1, width, rest_speed, at_end)
+        s0, level, found, rests = approach_search(a, b, t1, width, rest_speed, rested, at_end)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     s0, hit = checkpoint_name((s0, hit), FOUND)

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from diffrigid.world import World
 
 IMPACT, HOLD, REVERSE, PUSH = 0, 1, 2, 3
-HOLDS = 2  # passes to hold resting contacts until the first impact: one to its time in free fall, one from there
+HOLDS = 4  # passes to hold resting contacts until the first impact: to its time in free fall, then each time from there
 
 
 @pytree
@@ -165,7 +165,7 @@ class Progress(NamedTuple):
     resting: Array  # (C, *batch) bool: contacts that rest
     supported: Array | None  # (N, *batch) bool: bodies that rest on something where their paths begin
     known: Known | None
-    found: Array  # bool: the pass before had active contacts in some world
+    found: Array  # bool: in the pass before contacts were struck or held, or came to rest, in some world
     rests: Array  # (*batch) bool: some contact of a world rests
 
 
@@ -180,6 +180,7 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
     opened = jnp.zeros(dt.shape, bool) if known is None else push & known.opened(strikes)
     # A world without resting contacts holds none at the end: on its own it would skip this pass.
     strikes = replace(strikes, gap=_closed(strikes, opened), held=strikes.held & (impact | rests)[None])
+    rested = resting
     strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
     if known is not None:
         skips = reverse & ~known.reverses()
@@ -200,7 +201,9 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
 
     any_now = any_world(strikes.active)
     anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
-    return Progress(anchors, resting, supported, known, any_now, (resting | strikes.rests).any(0))
+    # What comes to rest hid what the same two may do later in the step.
+    found = any_now | any_world(impact & resting & ~rested)
+    return Progress(anchors, resting, supported, known, found, (resting | strikes.rests).any(0))
 
 
 def _closed(strikes: Strikes, opened: Array) -> Array:

@@ -46,13 +46,13 @@ ADVANCING, NEARING, POLISHING, DONE = range(4)
 
 
 def approach_search(
-    a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array, at_end: Array
+    a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array, rested: Array, at_end: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Search the next impact of any two shapes: its time, level of the gap, whether there is one, which contacts rest.
 
     With `at_end`, a bool, nothing is searched. Only the level has a gradient.
     """
-    task, live = task_of(a, b, t1, width, rest_speed), opaque_true(t1)
+    task, live = task_of(a, b, t1, width, rest_speed, rested), opaque_true(t1)
     search = _stage_by_stage if isinstance(b.shape, HalfSpace) else _in_one_loop
     end = search(task, jnp.where(at_end, task.t1, task.start), at_end, live)
     level, closest = checkpoint_name((end.level, end.closest), FOUND)

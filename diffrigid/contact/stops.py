@@ -172,16 +172,19 @@ def _row(kind: str, dt: Array, joint: Any, a: Flight, b: Flight, meeting: Meetin
     mobile += [(j[so.D :] * so.apply(i, j[so.D :])).sum(0) for i, j in zip(inverses, jac, strict=True)]
     first = unit_vector(jnp.zeros((so.D, *s.shape), s.dtype), 0)
     none, gap = jnp.zeros_like(first), _gap(kind, joint, a, b)
-    open_by = jnp.zeros_like(s) if kind == "friction" else gap(s)
+    start = jnp.maximum(a.t0, b.t0)
     if kind == "friction":  # mean acceleration since the paths begin
-        start = jnp.maximum(a.t0, b.t0)
+        open_by = begins_at = jnp.zeros_like(s)
         pull = safe_divide(rate - _rate(gap, start)[1], s - start)
     else:
+        open_by, begins_at = gap(s), gap(start)
         pull = lax.stop_gradient(_second(gap, s))
-    # Also a limit that has opened as its bodies fell away: it may close again once they are held.
+    # Also a limit that has opened as its bodies fell away, or that was shut where their paths begin, and may have
+    # rebounded: it may close again once they are held.
     falls = [jnp.concatenate([f.a, so.apply(i, f.tau)]) for i, f in zip(inverses, (a, b), strict=True)]
     closed = rounding(_near(joint, a, b, s))
     near = open_by <= closed + dt**2 * jnp.abs((jac * jnp.stack(falls)).sum(1)).sum(0)
+    near = near | (begins_at <= _near(joint, a, b, start))
     return Strikes(
         active=meeting.hit & (~meeting.held | meeting.rests[0] | near), s=s, gap=open_by, rounding=closed,
         deepest=jnp.full_like(s, jnp.inf), normal=first, arm_a=none, arm_b=none,

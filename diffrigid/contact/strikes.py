@@ -63,7 +63,13 @@ def find_strikes(
     """
     width = world.contact.width
     groups = [sides_of(world, pairs, flight, since, supported) for pairs in world.pairs]
-    meetings = [jax.vmap(lambda a, b: next_meeting(world, a, b, dt, at_end, width))(*sides) for sides in groups]
+    rested, start = [], 0
+    for pairs in world.pairs:
+        rows = len(pairs.a) * pairs.count
+        rested.append(resting[start : start + rows].reshape(-1, pairs.count, *dt.shape))
+        start += rows
+    meets = jax.vmap(lambda a, b, rested: next_meeting(world, a, b, dt, rested.any(0), at_end, width))
+    meetings = [meets(*sides, own) for sides, own in zip(groups, rested, strict=True)]
     if stops_of(world):
         meetings.append(meet_stops(world, flight, since, dt, at_end))
     a, b = pair_ends(world)
@@ -71,12 +77,10 @@ def find_strikes(
     a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
     links = Links(a, b, islands(ends_of(world.joints), len(world.names)))
     meetings = in_order(meetings, links, flight.t0, dt, at_end, bounces)
-    parts, jacs, start = [], {}, 0
-    for pairs, sides, meeting in zip(world.pairs, groups, meetings, strict=False):
-        rested = resting[start : start + len(pairs.a) * pairs.count].reshape(-1, pairs.count, *dt.shape)
-        start += len(pairs.a) * pairs.count
+    parts, jacs = [], {}
+    for sides, meeting, own in zip(groups, meetings, rested, strict=False):
         each = jax.vmap(functools.partial(strikes_of, dt=dt, loaded=is_loaded(world)))
-        part = unfused(opaque_true(dt), each, *sides, meeting, rested)
+        part = unfused(opaque_true(dt), each, *sides, meeting, own)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1], dt)
@@ -123,15 +127,18 @@ def is_loaded(world: "World") -> bool:
     return bool(world.forces or world.joints) or any(map(turns_a_side, world.pairs))
 
 
-def next_meeting(world: "World", a: Side, b: Side, dt: Array, at_end: Array, width: Array | None) -> Meeting:
+def next_meeting(
+    world: "World", a: Side, b: Side, dt: Array, rested: Array, at_end: Array, width: Array | None
+) -> Meeting:
     """The next impact of one pair, or the end of the step where `at_end` (a bool)."""
     straight = relative_path_is_straight(world, a.flight is not None and b.flight is not None)
-    return find_impact(a, b, dt, width, straight, world.contact.rest_speed, at_end)
+    return find_impact(a, b, dt, width, straight, world.contact.rest_speed, rested, at_end)
 
 
 def next_strikes(world: "World", a: Side, b: Side, dt: Array) -> Strikes:
     """The contacts of one pair at its next exact impact, (K, ...)."""
-    meeting, never = next_meeting(world, a, b, dt, jnp.asarray(False), None), jnp.zeros(dt.shape, bool)
+    never = jnp.zeros(dt.shape, bool)
+    meeting = next_meeting(world, a, b, dt, never, jnp.asarray(False), None)
     meeting = replace(meeting, now=meeting.fast, joins=never, held=never)
     return strikes_of(a, b, meeting, never[None], dt, loaded=False)
 
