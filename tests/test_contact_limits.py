@@ -368,6 +368,28 @@ def test_a_corner_that_rests_hides_no_impact_of_another():
     assert lowest.min() > -1e-5  # 15 mm where an impact is found a step late
 
 
+def test_a_tip_that_slides_down_one_side_of_a_valley_hides_no_impact_of_the_other():
+    """One tip of a rod slides down one side of a valley, the other side strikes the rod, and then its other tip."""
+    c, rod = np.sqrt(0.5), dr.Capsule(radius=0.1, half_length=0.25)
+    sides = {name: dr.Static(dr.HalfSpace(normal=(sign * c, c))) for name, sign in (("left", 1), ("right", -1))}
+    starts = [  # x, q, v, w
+        (0.173778970276597, 0.32114578301298985, -0.7188977065829815, -0.6951158806053344, 0.8003576539828867, -0.7717112530464109, 4.4472204935081905),
+        (-0.1753060073618868, 0.319656604682597, -0.7012240294167759, 0.712940993749483, -0.687823684629512, -0.6740201956935066, 3.852074029070639),
+        (-0.1704820085919278, 0.324276175039948, -0.6819280342977271, 0.7314192751348831, -0.8795377394096214, -0.8175918974164866, 4.80340403591766),
+    ]  # fmt: skip
+    bodies = sides | {"rod": dr.Body(rod, mass=1.0, x=(0.0, 1.0))}
+    world, _ = dr.scene(bodies, gravity=(0.0, -G), friction=0.2)
+
+    @jax.jit
+    def gaps(start):
+        x, q, v, w = jnp.split(start, (2, 4, 6))
+        state = dr.State(x=x[None], q=q[None] / jnp.linalg.norm(q), v=v[None], w=w[None])
+        return jnp.stack([dr.gap(world, dr.step(world, state, 1 / 60), "rod", side) for side in sides])
+
+    for start in starts:
+        assert gaps(jnp.array(start)).min() > -1e-6  # 24 to 30 mm where an impact is found a step late
+
+
 @pytest.mark.slow
 def test_an_edge_that_rests_hides_no_impact_of_another():
     """An edge of a box tips over one edge of another box and strikes a second, beside a corner: the nearer is first."""
@@ -384,6 +406,23 @@ def test_an_edge_that_rests_hides_no_impact_of_another():
     x, q, none = np.asarray(end.x[0]), np.asarray(end.q[0]), np.zeros(3)
     apart = separation(place(box, x, q, none), place(block, none, np.array([1.0, 0.0, 0.0, 0.0]), none))
     assert apart > -1e-6  # 0.5 mm where the second is taken for the first
+
+
+@pytest.mark.slow
+def test_an_edge_of_a_plate_that_tips_over_a_box_strikes_at_its_time():
+    """Of two crossings of edges that touch by turns the one that strikes comes nearer than the one that rested."""
+    start = {
+        "x": (0.7335753266951958, -0.02936037819418516, 0.05304783315657637),
+        "q": (0.9139449573427564, 0.05350130364943985, 0.11453316998582871, 0.38564799808705724),
+        "v": (1.1623862765270023, -0.363152212783107, -2.1489223759540987),
+        "w": (-4.591230076408363, 0.8826684519115975, 1.3725770827202728),
+    }
+    plate = dr.Body(dr.Box(half=(0.4, 0.3, 0.01)), mass=1.0, **start)
+    bodies = {"plate": plate, "box": dr.Static(dr.Box(half=(0.5, 0.5, 0.1)))}
+    world, state = dr.scene(bodies, gravity=(0.0, 0.0, -G), restitution=0.15, friction=0.53)
+    coarse, fine = (dr.rollout(world, state, dt=1 / 240 / n, steps=2 * n).state for n in (1, 16))
+    for leaf, exact in zip(jax.tree.leaves(coarse), jax.tree.leaves(fine), strict=True):
+        assert_allclose(leaf[-1], exact[-1], atol=2e-4)  # 0.8 m/s off, and 15 mm deep, where it strikes late
 
 
 def test_what_tumbles_on_a_box_does_so_as_on_a_half_space():

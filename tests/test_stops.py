@@ -193,6 +193,25 @@ def test_what_rests_on_the_stop_of_what_rests_on_its_stop(angle):
     assert_allclose(states.w, 0.0, atol=3e-4)
 
 
+def test_a_limit_that_the_floor_presses_shut_stays_shut():
+    """Two rods on a hinge fall on a smooth floor as a tent, and open until the hinge lets them no further."""
+    c, rod = np.sqrt(0.5), dr.Box(half=(0.5, 0.02))
+    left, right = (
+        dr.Body(rod, mass=1.0, x=(0.5 * side * c, 0.52 * c + 0.2), q=(c, -side * c), friction=0.0) for side in (-1, 1)
+    )
+    apex = dr.Revolute("right", "left", anchor_a=(-0.5, 0.0), anchor_b=(0.5, 0.0), upper=0.5, restitution=0.7)
+    bodies = {"left": left, "right": right, "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))}
+    world, state = dr.scene(bodies, joints={"apex": apex}, gravity=(0.0, -9.81))
+
+    @jax.jit
+    def angle(restitution):
+        made = dr.paths.write(world, state, "apex.restitution", restitution)
+        return dr.rollout(*made, dt=1 / 60, steps=90)["apex.angle"]
+
+    for restitution in (0.0, 0.7):
+        assert_allclose(angle(restitution)[60:], 0.5, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_stiff_hinge_carries_a_load_that_stands_on_it():
     """Contact and the friction of a joint act on one body: the shelf holds below friction = m g r, else it turns."""

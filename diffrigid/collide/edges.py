@@ -48,7 +48,10 @@ def crossing_edges(
     order = _order(crossing(down, across, margin[None, None]), separated, margin[None, None], deepest[None, None])
     order = jnp.moveaxis(order.reshape(size_a * size_b, *slack.shape), 0, -1)
     count = (CROSSINGS, 2, 1)[isinstance(a, Capsule) + isinstance(b, Capsule)]
-    nearest, index = (jnp.moveaxis(leaf, -1, 0) for leaf in lax.top_k(-order, count))
+    nearest, index = lax.top_k(-order, count)
+    # By number: in order of their distances they would change places within a step, and what is known of each be lost.
+    number = jnp.where(nearest > -FAR, index, size_a * size_b)
+    _, nearest, index = (jnp.moveaxis(leaf, -1, 0) for leaf in lax.sort((number, nearest, index)))
 
     def pick(of: Edges, row: Array) -> Edges:
         chosen = jax.nn.one_hot(row, of.start.shape[1], axis=0, dtype=of.start.dtype)
@@ -131,7 +134,7 @@ def _order(c: Crossing, separated: Array, slack: Array, deepest: Array) -> Array
 
 
 def _along_contact(c: Crossing, contacts: Contacts, slack: Array) -> Array:
-    """Whether each of K crossings, nearest first, is apart, or has about the contact normal of the two bodies.
+    """Whether each of K crossings is apart, or has about the contact normal of the two bodies.
 
     That is the normal of the deepest corner or, if none touches, of the nearest crossing that is not apart.
     """
@@ -140,6 +143,7 @@ def _along_contact(c: Crossing, contacts: Contacts, slack: Array) -> Array:
     def pick(index, normals):
         return (jax.nn.one_hot(index, len(normals), axis=0, dtype=slack.dtype)[:, None] * normals).sum(0)
 
-    corner, crossing = pick(jnp.argmin(contacts.gap, 0), contacts.normal), pick(jnp.argmin(apart, 0), c.normal)
+    nearest = jnp.argmin(jnp.where(apart, jnp.inf, jnp.abs(c.distance)), 0)
+    corner, crossing = pick(jnp.argmin(contacts.gap, 0), contacts.normal), pick(nearest, c.normal)
     normal = lax.stop_gradient(jnp.where((contacts.gap.min(0) <= slack)[None], corner, crossing))
     return apart | (jax.vmap(dot, in_axes=(0, None))(c.normal, normal) > ALIKE)
