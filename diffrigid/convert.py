@@ -21,7 +21,7 @@ from diffrigid.shapes import HalfSpace, dimension, traced, with_topology
 from diffrigid.state import axis_sizes, rotations
 
 TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: typed numbers have a few digits
-FLAT = 1e-9  # [-] of the largest principal inertia: a body with a smaller one has no thickness
+NO_THICKNESS = 1e-9  # [-] of the largest principal inertia: a body with a smaller one has no thickness
 
 Numbers = Any  # np.ndarray where known, Array where traced
 
@@ -228,7 +228,7 @@ def mass_and_inertia(name: str, body: Any, solid: Solid | None, dim: int) -> tup
     gyration = solid.gyration  # type: ignore[union-attr]
     if not traced(gyration) and dim == 3:
         low, _, high = np.linalg.eigvalsh(gyration)
-        if low <= FLAT * high:
+        if low <= NO_THICKNESS * high:
             raise ValueError(f"{name}.shape has no thickness, and so no inertia about its line: give inertia.")
     return mass, mass * gyration
 

@@ -31,7 +31,7 @@ TOGETHER = 1e-2  # [-] of it: gap up to which other points take part in an impac
 STRUCK = 1e-5  # [-] of the impulse of the forces: a smaller change of momentum is none
 BEYOND = 1.1  # [-] times the sizes,
 FASTER = 1.5  # [-] and times the path at the first speed: what is further apart does not meet
-TINY = 1e-9  # [m, N s] where there is no size, no force
+NO_SIZE = 1e-9  # [m, N s] where there is no size, no force
 WORK = 4_000_000  # pairs times intervals beyond which not all stored times are examined
 ROUGH = 5.0  # [-] an impulse that exceeds that of the forces in an interval by this factor is an impact
 
@@ -178,8 +178,8 @@ def _touches(world: World, group: Any, motion: Sampled, changes: Changes) -> Tou
     sides = _side(world, group.shape_a), _side(world, group.shape_b)
     a, b, rows = np.array(group.a), np.array(group.b), (np.array(group.row_a), np.array(group.row_b))
     h, size = np.diff(motion.t), np.minimum(sides[0].size[rows[0]], sides[1].size[rows[1]])
-    change = np.linalg.norm(changes.p, axis=2) + np.linalg.norm(changes.L, axis=2) / max(size.min(), TINY)
-    struck = change > STRUCK * (changes.push + TINY)
+    change = np.linalg.norm(changes.p, axis=2) + np.linalg.norm(changes.L, axis=2) / max(size.min(), NO_SIZE)
+    struck = change > STRUCK * (changes.push + NO_SIZE)
     struck = np.concatenate([struck, np.zeros((len(struck), len(world.static_names)), bool)], axis=1)
     apart = np.linalg.norm(motion.x[:-1, a] - motion.x[:-1, b], axis=2)
     path = h[:, None] * np.linalg.norm(motion.v[:-1, a] - motion.v[:-1, b], axis=2)

@@ -18,7 +18,7 @@ from diffrigid.shapes import Capsule, edge_apexes, edges, radius
 CROSSINGS = 8  # at most: of two rectangles face to face
 PARALLEL = 1e-3  # [rad] edges closer to parallel than this do not cross
 DIP = 1e-2  # [-] of the smaller size: so little may a face dip into another, beside a corner that does
-ALIKE = 0.5  # cosine: contacts of convex bodies that touch have one normal, up to their penetration
+ALONG_CONTACT = 0.5  # cosine: contacts of convex bodies that touch have one normal, up to their penetration
 
 
 class Edges(NamedTuple):
@@ -146,4 +146,4 @@ def _along_contact(c: Crossing, contacts: Contacts, slack: Array) -> Array:
     nearest = jnp.argmin(jnp.where(apart, jnp.inf, jnp.abs(c.distance)), 0)
     corner, crossing = pick(jnp.argmin(contacts.gap, 0), contacts.normal), pick(nearest, c.normal)
     normal = lax.stop_gradient(jnp.where((contacts.gap.min(0) <= slack)[None], corner, crossing))
-    return apart | (jax.vmap(dot, in_axes=(0, None))(c.normal, normal) > ALIKE)
+    return apart | (jax.vmap(dot, in_axes=(0, None))(c.normal, normal) > ALONG_CONTACT)

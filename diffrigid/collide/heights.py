@@ -34,7 +34,7 @@ from diffrigid.state import rotations
 FEATURES = 6  # of a cell: two faces, three edges, a node
 TOUCHES = 4  # contacts of a corner at most: a pit has three faces or more
 PEAKS = 4  # nodes at most that touch a body
-SAME = 1e-6  # [-] 1 - cosine: faces whose normals differ by less than 1.4 mrad are one plane
+ONE_PLANE = 1e-6  # [-] 1 - cosine: faces whose normals differ by less than 1.4 mrad are one plane
 SIGHT = 0.5  # [cells] that are looked up beyond the reach of a body, at least
 
 
@@ -147,7 +147,7 @@ def _nearest(c: Contacts, count: int, slack: Array | None) -> Contacts:
         taken, found = chosen > 0, (chosen * left).sum(0)
         if slack is not None:
             along = jax.vmap(dot, (0, None))(normal, (chosen[:, None] * normal).sum(0))
-            taken = taken | ((along > 1.0 - SAME) & (jnp.abs(gap - found[None]) <= slack[None]))
+            taken = taken | ((along > 1.0 - ONE_PLANE) & (jnp.abs(gap - found[None]) <= slack[None]))
         return jnp.where(taken, FAR, left), (index, found)
 
     _, (index, found) = lax.scan(pick, gap, length=min(count, len(gap)))

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from diffrigid.world import World
 
 CROWD = 256  # bodies, the least for which this way is taken
-ROUNDS = 4  # per sweep
+ROUNDS_PER_SWEEP = 4  # per sweep
 ROUNDING = 64  # [-] times eps times the speeds: slower closing counts as none
 SLOW = 1e-3  # [-] of `rest_speed`, likewise: else sticking bodies would take all rounds
 
@@ -190,7 +190,7 @@ def _impacts(crowd: Crowd, walls: list[Walls], near: Near, start: Anchors) -> An
     def maybe(carry: tuple[Anchors, Array], _: None) -> tuple[tuple[Anchors, Array], None]:
         return lax.cond(carry[1], lambda anchors, _: one_round(anchors), lambda *carry: carry, *carry), None
 
-    return lax.scan(maybe, (start, jnp.asarray(True)), length=ROUNDS * crowd.world.contact.sweeps)[0][0]
+    return lax.scan(maybe, (start, jnp.asarray(True)), length=ROUNDS_PER_SWEEP * crowd.world.contact.sweeps)[0][0]
 
 
 def _next(crowd: Crowd, walls: list[Walls], near: Near, bodies: Side) -> Encounters:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 RESTS = -1e30  # [s] marks an impact after which the bodies stay together
 CROWDED = 4  # pairs per body from which this way is faster than the list of pairs
-ROUNDS = 3  # at most, for the impacts of a pass; most passes need one, and reverse mode pays for each
+ROUNDS_PER_PASS = 3  # at most, for the impacts of a pass; most passes need one, and reverse mode pays for each
 
 
 def goes_in_rounds(world: "World") -> bool:
@@ -137,7 +137,7 @@ def next_impacts(world: "World", tables: tuple[Table, ...], flight: Flight, sinc
     before = constant(tuple(tuple(float(i < j) for j in range(moving)) for i in range(moving)), str(dt.dtype))
     rank = sum_of_terms(lax.expand_dims(before, range(2, 1 + lead.ndim)), lead[:, None], 0)[:, 0]
     needed = fold(jnp.add, lead, 0)
-    crossed, width = crossed | (needed > ROUNDS * slots_of(moving)), world.contact.width
+    crossed, width = crossed | (needed > ROUNDS_PER_PASS * slots_of(moving)), world.contact.width
     isolated = ~any_world(crossed if width is None else crossed | (width > 0))
     return Next(lead, rank, other), isolated, needed
 
@@ -155,7 +155,7 @@ def meet_in_rounds(
     def one_round(anchors, begin):
         return lax.cond(any_world(needed > begin), meet_from, lambda _, anchors: anchors, begin, anchors), None
 
-    begins = constant(tuple(float(count * k) for k in range(ROUNDS)), str(dt.dtype))
+    begins = constant(tuple(float(count * k) for k in range(ROUNDS_PER_PASS)), str(dt.dtype))
     return lax.scan(one_round, anchors, begins)[0]
 
 

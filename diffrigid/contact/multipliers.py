@@ -27,7 +27,7 @@ from diffrigid.linear import solve_regular
 from diffrigid.numerics import norm
 from diffrigid.state import rotations
 
-ROUNDS = 40  # at most
+MULTIPLIER_ROUNDS = 40  # at most
 SOFTNESS = 1e-2  # [-] 1 / (sigma k): about the fraction of the error in P that a round leaves
 READY = 1e-2  # [-] of u: error of the inner problem below which the multipliers are updated
 HALVINGS = 10  # bisections of the line search
@@ -74,7 +74,7 @@ def solve_roughly(cone: Cone, v_rel: Array, arms: Any, mobility: Mobility, error
     u, least = twists(nothing, arms, mobility), jnp.full(v_rel.shape[2:], jnp.inf, v_rel.dtype)
 
     def busy(carry):
-        return (carry[0] < ROUNDS) & any_world(carry[-1] > enough)
+        return (carry[0] < MULTIPLIER_ROUNDS) & any_world(carry[-1] > enough)
 
     return lax.while_loop(busy, again, (0, u, nothing, nothing, least))[3]
 

@@ -14,7 +14,7 @@ BLOCKS = 20  # pieces of time that stand for independent runs where there is onl
 LEFT = 0.01  # [-] of the information in a direction: if all clusters but one have less, they do not determine it
 DRAWS = 2000  # of the bootstrap
 LEAST_FREE = 0.05  # [-] least share of degrees of freedom that is taken to be left
-MANY = 1e6  # degrees of freedom for which Student's distribution is the normal one
+NORMAL_FREEDOM = 1e6  # degrees of freedom for which Student's distribution is the normal one
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def check_intervals(intervals: Intervals) -> None:
 def from_jacobian(linear: Linear) -> Uncertainty:
     """Covariance (J^T J)^-1: right where residuals are independent and the model holds. The usual one."""
     numbers = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
-    freedom = max(sum(map(len, linear.rows)) - numbers, 1) if linear.estimated else MANY
+    freedom = max(sum(map(len, linear.rows)) - numbers, 1) if linear.estimated else NORMAL_FREEDOM
     return Uncertainty(linear.variance * inverse(information(linear)), float(freedom))
 
 

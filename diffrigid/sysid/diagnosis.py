@@ -9,9 +9,11 @@ import numpy as np
 from diffrigid.sysid.covariance import Linear, eliminated
 from diffrigid.sysid.free import Free
 
-ALIKE = 1e-8  # [-] eigenvalue of the scaled information below which effects are the same: a correlation of 1 - 1e-8
+SAME_EFFECT = (
+    1e-8  # [-] eigenvalue of the scaled information below which effects are the same: a correlation of 1 - 1e-8
+)
 ROUNDING = 1e-12  # [-] of the largest effect: a smaller one counts as none
-SMALL = 0.05  # [-] parts of a direction below this share of its largest are rounding, each as large as its effect
+NEGLIGIBLE = 0.05  # [-] parts of a direction below this share of its largest are rounding, each as large as its effect
 LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that hardly determines it
 RARE = 1e-3  # chance below which residuals are not taken for noise
 LAGS = 5  # largest lag of the autocorrelation of residuals
@@ -73,9 +75,9 @@ def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[
     seen = np.flatnonzero(~unseen)
     scaled = J[:, seen] / sizes[seen]
     values, vectors = np.linalg.eigh(scaled.T @ scaled) if len(seen) else (np.zeros(0), np.zeros((0, 0)))
-    for vector in reduced(vectors[:, values < ALIKE * values.max(initial=1e-300)].T):
+    for vector in reduced(vectors[:, values < SAME_EFFECT * values.max(initial=1e-300)].T):
         direction = np.zeros(len(coordinates))
-        kept = np.abs(vector) >= SMALL * np.abs(vector).max()
+        kept = np.abs(vector) >= NEGLIGIBLE * np.abs(vector).max()
         direction[seen] = np.where(kept, vector, 0.0) / sizes[seen]
         out.append(_blind(direction, coordinates))
     return out

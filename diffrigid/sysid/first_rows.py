@@ -12,7 +12,7 @@ from diffrigid.state import State, rotations
 from diffrigid.sysid.columns import Series
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.parameters import Slot
-from diffrigid.sysid.records import SAME, Run
+from diffrigid.sysid.records import SAME_TIME, Run
 from diffrigid.sysid.sensors import Channel, JointPart, Marker, Part
 from diffrigid.world import World
 
@@ -80,7 +80,7 @@ def shown(
             owner, rate = world.names[observer.body], RATES[observer.field]
         else:
             continue
-        later = s.t >= start - SAME
+        later = s.t >= start - SAME_TIME
         t, values = s.t[later] - start, (s.values[later] - channel.bias) / channel.scale
         pose, slope = _turning(world.dim, t, values) if observer.field == "q" else _line(t, values, observer.field)
         out |= {f"{owner}.{observer.field}": pose, f"{owner}.{rate}": slope}
@@ -100,10 +100,10 @@ def _marked(
         if isinstance(channels[s.name].observer, Marker):
             by_body.setdefault(channels[s.name].observer.body, []).append(s)
     for body, markers in by_body.items():
-        t = np.unique(np.concatenate([s.t[s.t >= start - SAME] for s in markers]))
+        t = np.unique(np.concatenate([s.t[s.t >= start - SAME_TIME] for s in markers]))
         places = np.full((len(t), len(markers), world.dim), np.nan)
         for k, s in enumerate(markers):
-            channel, later = channels[s.name], s.t >= start - SAME
+            channel, later = channels[s.name], s.t >= start - SAME_TIME
             places[np.searchsorted(t, s.t[later]), k] = (s.values[later] - channel.bias) / channel.scale
         points = np.stack([np.asarray(channels[s.name].observer.point, float) for s in markers])
         known_rows = np.flatnonzero(np.isfinite(places).all(2).sum(1) >= world.dim)[:ROWS]

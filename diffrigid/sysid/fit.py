@@ -35,8 +35,8 @@ from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 
 SQUARES = Squares()
-FAR = 0.1  # [-] of the spread of a column: larger residuals that are not noise are named before a blind parameter
-ALIKE = 0.5, 1e-3  # absolute, and relative to the best loss: a start that ends within their sum agrees with the best
+NOT_SMALL = 0.1  # [-] of the spread of a column: larger residuals that are not noise are named before a blind parameter
+AGREES = 0.5, 1e-3  # absolute, and relative to the best loss: a start that ends within their sum agrees with the best
 
 
 def fit(
@@ -179,7 +179,7 @@ def finish(
         remarks = [*jump, *(remark for remark in remarks if remark == INTERRUPTED)]
     remarks = [*remarks, *remarks_on(problem, scenes, in_units), *stuck]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
-    order, alike = np.argsort(costs), costs <= costs[best] + ALIKE[0] + ALIKE[1] * costs[best]
+    order, alike = np.argsort(costs), costs <= costs[best] + AGREES[0] + AGREES[1] * costs[best]
     summary = Summary(
         parameters=parameters, noise=_all_noise(problem), costs=costs[order],
         orders=impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum())),
@@ -270,7 +270,7 @@ def _refuse_blind(problem: Problem, linear: Linear, residuals: Sequence[dict[str
     for slot, rows in pieces(problem.slots):
         if not np.any(sizes[rows] > 0):
             blind = f"nothing that was measured depends on {slot.name} at the best fit"
-            if failure := failed(problem, residuals, FAR):
+            if failure := failed(problem, residuals, NOT_SMALL):
                 raise ValueError(f"{failure}. There {blind}")
             raise ValueError(
                 f"free: {blind}: "

@@ -24,7 +24,7 @@ from diffrigid.sysid.problem import Group, linearise
 FAINT = 1e-2  # [-] of the largest slope: a number with a smaller slope is damped as if it had this one
 DAMPING = (1e-9, 1e9)  # least and most; the least holds slopes below 3e-7 of the largest: rounding, or yielding joints
 STIFF = 1e7  # a damping above which a start counts as converged
-SMALL = 1e-9  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
+NO_GAIN = 1e-9  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
 SETTLED = 1e-8  # decrease of the cost, relative to it, below which an accepted step was the last
 ITERATIONS = 60  # at most, unless another number is asked for
 INTERRUPTED = "interrupted: the best so far"
@@ -178,7 +178,7 @@ def update(
     gain = jnp.where(alone, gain, (gain.sum(0) - 0.5 * (eq.g * shared).sum(-1))[None])
     level = after / sum(len(r) for r in point.residuals)
     settled = settled & (gain <= 100.0 * SETTLED * after)
-    done = (gain < SMALL * level) | settled | (damping > STIFF) | ~jnp.isfinite(level)
+    done = (gain < NO_GAIN * level) | settled | (damping > STIFF) | ~jnp.isfinite(level)
     step = Numbers(shared.T, jnp.transpose(own, (2, 1, 0)))
     step = jax.tree.map(lambda dz, most: jnp.clip(jnp.where(jnp.isfinite(dz), dz, 0.0), -most, most), step, reach)
     return Progress(point, cost, damping, done), jax.tree.map(jnp.add, point.z, step)

@@ -12,7 +12,7 @@ import numpy as np
 from diffrigid.impacts import order_of_impacts
 from diffrigid.sysid.levenberg import Numbers
 from diffrigid.sysid.problem import LOOKED_AT, linearise, of_record
-from diffrigid.sysid.records import SAME
+from diffrigid.sysid.records import SAME_TIME
 from diffrigid.sysid.setup import Problem, fitted_scene
 from diffrigid.sysid.times import controls_over
 from diffrigid.trajectory import Trajectory
@@ -39,7 +39,7 @@ def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
             run = problem.runs[group.members[k]]
             t = np.concatenate([[0.0], np.cumsum(of_record(group.data.lengths, k), dtype=float)])
             end = max(series.t[-1] for series in run.series) - run.start
-            t = t[t <= end + SAME]  # shorter records are padded
+            t = t[t <= end + SAME_TIME]  # shorter records are padded
             controls = controls_over(run, run.start + t[:-1])
             for start in range(starts):
                 scene = fitted_scene(problem, group, k, shared[:, start], own[..., start])

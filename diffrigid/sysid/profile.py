@@ -18,7 +18,7 @@ WIDE = 1.6  # [-] of the half width of the interval from the Jacobian: extent of
 FURTHER = 3  # how often that is then doubled, where the cost has not risen to the level
 REFINED = 2  # how often the level is bracketed again after such steps
 HELD = 30  # iterations for the other numbers
-FAR = 15.0  # z at which a bounded number is at its bound to single precision
+AT_BOUND = 15.0  # z at which a bounded number is at its bound to single precision
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
     quantile = fit.uncertainty.quantile
     deviation = float(np.sqrt(fit.covariance[index, index]))
     half = WIDE * quantile * deviation if np.isfinite(deviation) and deviation < 10 else 5.0
-    level, most = 0.5 * quantile**2, np.inf if np.isinf(kind.low) else FAR
+    level, most = 0.5 * quantile**2, np.inf if np.isinf(kind.low) else AT_BOUND
     z = fit.shared[index] + np.linspace(-half, half, points)
     z, rise = _extended(fit, index, z, level, points // 2, most)
     ends = [_crossing(z - fit.shared[index], rise, level, side) for side in (-1, 1)]

@@ -15,7 +15,7 @@ from diffrigid.sysid.sensors import Channel
 from diffrigid.tables import moment
 from diffrigid.world import World, check
 
-SAME = 1e-9  # [s] times of different columns that are this close are the same
+SAME_TIME = 1e-9  # [s] times of different columns that are this close are the same
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
             "acts, or leave the force out of the scene"
         )
     for control in controls:
-        if control.t[0] > start + SAME:
+        if control.t[0] > start + SAME_TIME:
             raise ValueError(
                 f"{where}[{control.name!r}] begins at {moment(control.t[0])} s, after the start {moment(start)} s: "
                 "what acts before?"

@@ -21,7 +21,7 @@ from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.points import by_column
-from diffrigid.sysid.records import SAME, runs, same_data
+from diffrigid.sysid.records import SAME_TIME, runs, same_data
 from diffrigid.sysid.setup import Problem, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Parameter, Summary
 from diffrigid.sysid.table import html_table, text_table
@@ -148,7 +148,7 @@ class Fit:
         """
         scene, run = self.scenes[checked_record(self, record)], self.problem.runs[record]
         wanted = all_times(run) if times is None else np.asarray(times, float)
-        if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME or not (np.diff(wanted) > 0).all():
+        if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME_TIME or not (np.diff(wanted) > 0).all():
             given = f"times has shape {wanted.shape}" + (f" and begins at {wanted.flat[0]:g} s" if wanted.size else "")
             raise ValueError(
                 f"{given}: expected increasing times from {run.start:g} s on, where record {record} starts"

@@ -28,7 +28,7 @@ from diffrigid.sysid.columns import columns
 from diffrigid.sysid.first_rows import shown, with_values
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import Each, each, real
-from diffrigid.sysid.records import SAME, Record
+from diffrigid.sysid.records import SAME_TIME, Record
 from diffrigid.sysid.result import Fit, checked_fit
 from diffrigid.sysid.sensors import Part
 from diffrigid.sysid.times import motion
@@ -61,8 +61,8 @@ def segments(world: World, state: State, observations: Any, count: int) -> list[
     edges = np.linspace(first, last, count + 1)
     out = []
     for start, end in itertools.pairwise(edges):
-        start = max(s.t[s.t <= start + SAME][-1] for s in series if (s.t <= start + SAME).any())
-        use = {s.name: (s.t >= start - SAME) & (s.t <= end + SAME) for s in series}
+        start = max(s.t[s.t <= start + SAME_TIME][-1] for s in series if (s.t <= start + SAME_TIME).any())
+        use = {s.name: (s.t >= start - SAME_TIME) & (s.t <= end + SAME_TIME) for s in series}
         if few := [name for name, rows in use.items() if rows.sum() < 2]:
             raise ValueError(
                 f"count is {count}: rows of {few[0]!r} from {start:g} to {end:g} s: {use[few[0]].sum()}, expected two "

@@ -30,9 +30,11 @@ from diffrigid.sysid.records import Run, noise_guess, runs, series_of
 from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
 
-MANY = 50_000  # steps of a record beyond which the unit of its times is doubted
+MANY_STEPS = 50_000  # steps of a record beyond which the unit of its times is doubted
 SPARSE = 40  # likewise steps from one row to the next, where their length was not given
-LEAST = 1e-12  # [-] of the largest value of its column: smaller noise is rounding, of a simulation in double precision
+LEAST_NOISE = (
+    1e-12  # [-] of the largest value of its column: smaller noise is rounding, of a simulation in double precision
+)
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def _doubt_times(found: Sequence[Run], longest: float, given: bool) -> None:
     """Warn of times that would take very many steps of `longest` [s], whose length the user gave or not."""
     lasts = max(float(series.t[-1]) - run.start for run in found for series in run.series)
     apart = float(np.median(np.concatenate([np.diff(series.t) for run in found for series in run.series])))
-    if lasts > MANY * longest or (apart > SPARSE * longest and not given):
+    if lasts > MANY_STEPS * longest or (apart > SPARSE * longest and not given):
         warnings.warn(
             f"a record lasts {lasts:.3g} s, with rows {apart:.2g} s apart, which takes {lasts / longest:.2g} steps of "
             f"{longest:.2g} s: if its times are in ms, or numbers of frames, make them seconds; else give dt",
@@ -196,7 +198,7 @@ def least_noise(problem: Problem, name: str) -> float:
     """Smallest noise of a column that is estimated, in its unit: rounding of the simulation."""
     values = [np.nan_to_num(series_of(run, name).values) for run in problem.runs if name in run.channels]
     size = max(float(np.abs(part).max()) for part in values)
-    return max(LEAST, 8 * float(np.finfo(problem.dtype).eps)) * (size or 1.0)
+    return max(LEAST_NOISE, 8 * float(np.finfo(problem.dtype).eps)) * (size or 1.0)
 
 
 def _resumed(found: list[Run], saved: Any, slots: Sequence[Slot], places: Sequence[int | None]) -> list[Run]:

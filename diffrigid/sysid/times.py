@@ -10,7 +10,7 @@ from diffrigid.convert import positive
 from diffrigid.forces import is_constant
 from diffrigid.step import rollout, steps_in
 from diffrigid.sysid.parameters import Scene
-from diffrigid.sysid.records import SAME, Run
+from diffrigid.sysid.records import SAME_TIME, Run
 from diffrigid.trajectory import Trajectory
 
 LONGEST = 0.02  # [s] longest step, where its length is not given and matters
@@ -31,7 +31,7 @@ def longest_step(found: Sequence[Run], dt: float | None) -> float:
 
 def controls_over(run: Run, t: np.ndarray) -> dict[str, np.ndarray] | None:
     """Controls (S, size) of a record over steps that begin at times t (S,) [s]: each value is held until the next."""
-    rows = {c.name: np.searchsorted(c.t, t + SAME, side="right") - 1 for c in run.controls}
+    rows = {c.name: np.searchsorted(c.t, t + SAME_TIME, side="right") - 1 for c in run.controls}
     return {c.name: c.values[np.maximum(rows[c.name], 0)] for c in run.controls} or None
 
 
@@ -42,7 +42,7 @@ def all_times(run: Run) -> np.ndarray:
 
 def _once(*times: Any) -> np.ndarray:
     t = np.unique(np.concatenate(times))
-    return t[np.concatenate([[True], np.diff(t) > SAME])]
+    return t[np.concatenate([[True], np.diff(t) > SAME_TIME])]
 
 
 def _with_changes(run: Run, t: np.ndarray) -> np.ndarray:
@@ -55,7 +55,7 @@ def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
     since = _with_changes(run, _once([run.start], t))
     controls = controls_over(run, since[:-1])
     states = rollout(scene.world, scene.state, dt=longest, times=since - run.start, controls=controls).state
-    wanted, gaps = np.searchsorted(since, t - SAME), np.diff(since)[:, None]
+    wanted, gaps = np.searchsorted(since, t - SAME_TIME), np.diff(since)[:, None]
 
     def mean(values: np.ndarray) -> np.ndarray:
         return np.add.reduceat(gaps * values, wanted[:-1]) / np.diff(t)[:, None]
@@ -74,5 +74,5 @@ def grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     gaps = np.diff(t)
     counts = steps_in(gaps, longest)
     ends = np.concatenate([[0], np.cumsum(counts)])
-    index = {s.name: ends[np.clip(np.searchsorted(t, s.t - SAME), 0, len(t) - 1)] for s in run.series}
+    index = {s.name: ends[np.clip(np.searchsorted(t, s.t - SAME_TIME), 0, len(t) - 1)] for s in run.series}
     return np.repeat(gaps / counts, counts), index

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from diffrigid.sysid.result import Fit
 
 LASTS = 4.0  # [s] shorter motions are slowed down to last this long
-NEAR = 4.0  # [-] times the level of the interval: up to there a profile is drawn
+PROFILE_HEIGHT = 4.0  # [-] times the level of the interval: up to there a profile is drawn
 LEAD = """Values with 95 % intervals, what the data cannot tell, the fitted motion over what was measured, and what is
 left of the residuals. This file needs nothing but itself."""
 
@@ -151,7 +151,7 @@ def cost_chart(fit: "Fit") -> str:
 
 def profile_chart(found: ProfileLikelihood) -> str:
     """Chart of the rise of the cost when one number is held; dashed: the ends of its interval."""
-    near = found.rise < NEAR * found.level
+    near = found.rise < PROFILE_HEIGHT * found.level
     values, rise = found.values[near], found.rise[near]
     level = Curve(values, np.full(len(values), found.level), "95 % level", 1)
     curves = [Curve(values, rise), Curve(values, rise, points=True), level]
