@@ -145,7 +145,8 @@ def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:
     number = {f: float(value) for f, value in given.items() if value is not None and not traced(value)}
     lower, upper = number.get("lower", -np.inf), number.get("upper", np.inf)
     if not lower < upper:
-        raise ValueError(f"{name}.lower is {lower:g} and upper {upper:g}: expected lower < upper; swap them, or, if equal, use a Weld.")
+        fix = "use a Weld" if lower == upper else "swap them"
+        raise ValueError(f"{name}.lower is {lower:g} and upper {upper:g}: expected lower < upper; {fix}.")
     if isinstance(joint, Revolute) and 2.0 * np.pi <= upper - lower < np.inf:
         raise ValueError(
             f"{name} has limits from {lower:g} to {upper:g} rad: expected less than a turn; leave them out, or one."
