@@ -24,7 +24,7 @@ from diffrigid.constraints import by_twists, joint_jacobian, placed
 from diffrigid.elimination import islands
 from diffrigid.forces import total_wrench, within
 from diffrigid.joints import Pose
-from diffrigid.linkage import by_body, ends_of, to_sides, twists_of
+from diffrigid.linkage import by_body, ends_of, mobility_along, to_sides, twists_of
 from diffrigid.state import State, momentum, rotations, spin
 from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
@@ -203,13 +203,13 @@ def _driven(
         return joint.coordinate(so, a, b)[None]
 
     ways = [by_twists(so, coordinate, *poses)[0].reshape(u0.shape) for poses in (start, end)]
-    way, turn = 0.5 * (ways[0] + ways[1]), ways[1][:, so.D :]
+    way = 0.5 * (ways[0] + ways[1])
     rates = [(way * u).sum() for way, u in zip(ways, (u0, u1), strict=True)]
     held, impulse = jnp.asarray(False), jnp.zeros_like(h)
     if joint.damping is not None:
         impulse = impulse - joint.damping * h * 0.5 * (rates[0] + rates[1])
     if joint.friction is not None:
-        mobile = (mass * (ways[1][:, : so.D] ** 2).sum(1)).sum() + (turn * jax.vmap(so.apply)(inertia, turn)).sum()
+        mobile = mobility_along(so, ways[1], mass, inertia)
         slower = (0.0 if joint.speed is None else joint.speed) - rates[1]
         rounding = ROUNDING * jnp.finfo(h.dtype).eps * jnp.abs(ways[1] * u1).sum()
         slips = jnp.abs(slower) > SLACK * joint.friction * h * mobile + rounding

@@ -10,7 +10,7 @@ import numpy as np
 
 from diffrigid.constraints import joint_rates, placed
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
-from diffrigid.joints import JOINTS, Distance, Pose, Prismatic, Revolute, separation
+from diffrigid.joints import JOINTS, Distance, Pose, Prismatic, Revolute, places, separation
 from diffrigid.linkage import ends_of, to_sides, twists_of
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
@@ -91,13 +91,8 @@ def _allowed(joint: Any, so: Any, a: Pose, b: Pose, to_world: bool, rows: int) -
     """Errors (E,) [m, rad] that typed numbers, or the rounding of large ones, explain."""
     arms = float(np.linalg.norm(joint.anchor_a) + (0.0 if to_world else np.linalg.norm(joint.anchor_b)))
     metres = {Distance: 1, Prismatic: so.D - 1}.get(type(joint), so.D)
-    of_places = max(TYPED * min(1.0, SHORT * arms), _rounding() * float(known(_places, joint, a, b)))
+    of_places = max(TYPED * min(1.0, SHORT * arms), _rounding() * float(known(places, joint, a, b)))
     return np.where(np.arange(rows) < metres, of_places, TYPED)
-
-
-def _places(joint: Any, a: Pose, b: Pose) -> Any:
-    """Sum of the lengths that the error of a joint is the difference of, (*batch) [m]."""
-    return norm(a.x) + norm(b.x) + norm(joint.anchor_a) + norm(joint.anchor_b)
 
 
 def _rounding() -> float:
@@ -181,8 +176,8 @@ def warn_of_torn_joints(world: "World", state: State) -> None:
         for group in world.joints:
             at = placed((group,), world.statics, state.x, state.q)
             u = to_sides(ends_of((group,)), twists_of(state))
-            rates, places = joint_rates(so, at, u), jax.vmap(_places)(*at[0])
-            sizes = jnp.sqrt((u[..., : so.D] ** 2).sum((1, 2))) + places * jnp.sqrt((u[..., so.D :] ** 2).sum((1, 2)))
+            rates, far = joint_rates(so, at, u), jax.vmap(places)(*at[0])
+            sizes = jnp.sqrt((u[..., : so.D] ** 2).sum((1, 2))) + far * jnp.sqrt((u[..., so.D :] ** 2).sum((1, 2)))
             parts.append(jnp.stack([jnp.sqrt((rates**2).sum(1)), jnp.maximum(_rounding() * sizes, TYPED)]))
         return jnp.concatenate(parts, axis=1)
 

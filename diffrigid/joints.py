@@ -176,7 +176,7 @@ class Prismatic:
 
     def scale(self, a: Pose, b: Pose) -> Array:
         """What the rounding of the coordinate is relative to, (*batch) [m]."""
-        return norm(a.x) + norm(b.x) + norm(self.anchor_a) + norm(self.anchor_b)
+        return places(self, a, b)
 
 
 @pytree
@@ -206,6 +206,11 @@ JOINTS = (Revolute, Ball, Weld, Prismatic, Distance)
 def separation(joint: Any, so: ModuleType, a: Pose, b: Pose) -> Array:
     """Vector from anchor b to anchor a, (D, *batch) [m]."""
     return a.x + so.rotate(a.q, joint.anchor_a) - b.x - so.rotate(b.q, joint.anchor_b)
+
+
+def places(joint: Any, a: Pose, b: Pose) -> Array:
+    """Sum of the lengths that the separation of the anchors is the difference of, (*batch) [m]."""
+    return norm(a.x) + norm(b.x) + norm(joint.anchor_a) + norm(joint.anchor_b)
 
 
 def _turn(joint: Any, so: ModuleType, a: Pose, b: Pose) -> Array:

@@ -220,13 +220,18 @@ def _damping(group: Any, at: PlacedJoints, link: Linkage, twists: Array, share: 
 
     def resisting(joint: Any, a: Pose, b: Pose, u: Array, mass: Array, inertia: Array) -> Array:
         along = by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0].reshape(u.shape)
-        turn = along[:, so.D :]
-        mobile = (mass * (along[:, : so.D] ** 2).sum(1)).sum(0) + (turn * jax.vmap(so.apply)(inertia, turn)).sum((0, 1))
-        damping = joint.damping * share(joint.damping * mobile)
+        damping = joint.damping * share(joint.damping * mobility_along(so, along, mass, inertia))
         return -(damping * (along * u).sum((0, 1)))[None, None] * along
 
     of_both = (to_sides(ends, leaf) for leaf in (twists, link.inverse_mass, link.inverse_inertia))
     return by_body(ends, len(twists), of_each(resisting, (at,), *of_both))
+
+
+def mobility_along(so: Any, along: Array, mass: Array, inertia: Array) -> Array:
+    """J M^-1 J^T of one row `along` (2, D + A, *batch) of two bodies, by their inverse masses (2, *batch) [1/kg] and
+    inverse inertias (2, ..., *batch) [1/(kg m^2)] in world axes, (*batch)."""
+    turn = along[:, so.D :]
+    return (mass * (along[:, : so.D] ** 2).sum(1)).sum(0) + (turn * jax.vmap(so.apply)(inertia, turn)).sum((0, 1))
 
 
 def _resolved(steps: Array) -> Array:

@@ -84,6 +84,9 @@ def spin(bodies: Bodies, state: State) -> Array:
 def kinetic_energy(bodies: Bodies, state: State) -> Array:
     """Kinetic energy of each body, m v.v / 2 + w.L / 2, (N, *batch) [J].
 
+    Raises:
+        ValueError: a state that is not of these bodies, or of many times.
+
     Example:
         >>> energy = jax.vmap(dr.kinetic_energy, (None, 0))(world.bodies, trajectory.state)  # (T+1, N)
         >>> round(float(energy[-1, 0]), 4)
@@ -95,7 +98,7 @@ def kinetic_energy(bodies: Bodies, state: State) -> Array:
 
 
 def momentum(bodies: Bodies, state: State) -> Array:
-    """Linear momentum of each body, m v, (N, D, *batch) [kg m/s].
+    """Linear momentum of each body, m v, (N, D, *batch) [kg m/s]. Raises as `kinetic_energy`.
 
     Example:
         >>> dr.momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()
@@ -142,6 +145,9 @@ def material_point(state: State, body: int, point: Any) -> Array:
     Args:
         body: index of the body.
         point: (D, *batch) [m], body axes, from the centre of mass.
+
+    Raises:
+        ValueError: a state of many times, no such body, a point of another dimension.
 
     Example:
         >>> quarter = dr.replace(state, q=jnp.array([[0.0, 1.0]]))

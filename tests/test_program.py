@@ -1,17 +1,19 @@
 """The size of the programs that are compiled, which their compile time goes with, in operations of JAX."""
 
+import functools
 import itertools
 
 import jax
+import numpy as np
 
 import diffrigid as dr
 
 STEPS, DT = 20, 1 / 240
-MARGIN = 1.1  # [-] of the operations: so much may depend on the numbers of bodies and steps
+MARGIN = 1.1  # what a change may add without a thought
 
 
 def discs(side):
-    """A box full of discs, as in S2 of experiments/throughput.py."""
+    """A box full of discs, as in S2 of experiments/throughput.py with side 4."""
     disc = dr.Disc(radius=0.1)
     bodies = {
         f"{i}{j}": dr.Body(disc, mass=1.0, x=(0.25 + 0.5 * i, 0.25 + 0.5 * j))
@@ -20,6 +22,13 @@ def discs(side):
     for name, (x, y) in {"left": (1, 0), "right": (-1, 0), "floor": (0, 1), "lid": (0, -1)}.items():
         bodies[name] = dr.Static(dr.HalfSpace(normal=(x, y), offset=min(0.5 * side * (x + y), 0.0)))
     return dr.scene(bodies, restitution=1.0, contact=dr.Contact(sweeps=1))
+
+
+def cube():
+    """Over a floor, as in S4."""
+    body = dr.Body(dr.Box(half=np.full(3, 0.05)), mass=0.37, x=(0.0, 0.0, 0.3))
+    bodies = {"cube": body, "floor": dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))}
+    return dr.scene(bodies, gravity=(0.0, 0.0, -9.81), friction=0.2, restitution=0.3)
 
 
 def operations(jaxpr):
@@ -36,14 +45,20 @@ def operations(jaxpr):
     return count(jaxpr.jaxpr)
 
 
-def size(side, steps):
+@functools.cache
+def size(scene, *args, steps=STEPS):
     """Operations of the gradient of a rollout, most of which are those of rollouts."""
 
     def end(world, state):
         return (dr.rollout(world, state, dt=DT, steps=steps).state.x[-1] ** 2).sum()
 
-    return operations(jax.jit(jax.grad(end, (0, 1))).trace(*discs(side)).jaxpr)
+    return operations(jax.jit(jax.grad(end, (0, 1))).trace(*scene(*args)).jaxpr)
+
+
+def test_programs_do_not_grow_unnoticed():
+    assert size(discs, 4) < MARGIN * 28200
+    assert size(cube) < MARGIN * 33700
 
 
 def test_programs_do_not_grow_with_bodies_and_steps():
-    assert size(4, 2 * STEPS) < MARGIN * size(3, STEPS)
+    assert size(discs, 4) < MARGIN * size(discs, 3, steps=2 * STEPS)
