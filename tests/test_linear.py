@@ -39,4 +39,6 @@ def test_residuals_of_stiff_systems_are_of_the_order_of_rounding(size, transpose
 @pytest.mark.parametrize("size", [UNROLLED, 2 * UNROLLED])
 def test_singular_systems_give_finite_numbers(size):
     matrix = jnp.zeros((size, size, 1)).at[0, 0].set(2.0)
-    assert np.all(np.isfinite(solve_regular(matrix, jnp.ones((size, 1)))))
+    x = solve_regular(matrix, jnp.ones((size, 1)))
+    assert np.all(np.isfinite(x))
+    assert x[0, 0] == 0.5 or size > UNROLLED

@@ -131,4 +131,4 @@ def test_fit_from_the_command_line(tmp_path):
     (tmp_path / "other.csv").write_text("times,x,p.x[1]\n0,0,0\n1,0,0\n")
     with pytest.raises(SystemExit), contextlib.redirect_stderr(said):
         main(["fit", files[0], str(tmp_path / "other.csv")])
-    assert "has no column 'time': did you mean 'times'?" in said.getvalue()
+    assert "has no column 'time', which is 't' here: did you mean 'times'?" in said.getvalue()

@@ -71,11 +71,11 @@ def columns(
 
 
 def read_csv(
-    path: str | Path, left_out: Collection[str] = (), only: Collection[str] | None = None
+    path: str | Path, left_out: Collection[str] = (), only: Mapping[str, str] | None = None
 ) -> dict[str, np.ndarray]:
     """Read the columns of a file with one line of names; an empty cell is a missing value.
 
-    Those that are `left_out`, and with `only` all others than these, may hold anything.
+    Those that are `left_out`, and with `only`, names of columns and what these are for, all others, may hold anything.
 
     Between columns are commas, or semicolons or tabs where the names have these; numbers may then have decimal commas.
     """
@@ -93,8 +93,9 @@ def read_csv(
     if not rows:
         raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
     names, body = [name.strip() for name in rows[0][1]], [row for _, row in rows[1:]]
-    if lost := sorted(set(only or ()) - set(names)):
-        raise ValueError(f"{path} has no column {lost[0]!r}: {nearest(lost[0], names)}")
+    for name, use in (only or {}).items():
+        if name not in names:
+            raise ValueError(f"{path} has no column {name!r}, which is {use!r} here: {nearest(name, names)}")
     kept = [k for k, name in enumerate(names) if name not in left_out and (only is None or name in only)]
     if twice := [names[k] for k in kept if names[k] in names[:k]]:
         raise ValueError(f"{path}: two columns have the name {twice[0]!r}: rename one, or leave it out")

@@ -46,5 +46,5 @@ def _record(path: str, columns: Mapping[str, tuple[str, float]]) -> Any:
     """A file, or those of its columns that are named, by their names here."""
     if not columns:
         return path
-    table = read_csv(path, only=[theirs for theirs, _ in columns.values()])
+    table = read_csv(path, only={theirs: ours for ours, (theirs, _) in columns.items()})
     return {ours: factor * table[theirs] for ours, (theirs, factor) in columns.items()}
