@@ -75,6 +75,22 @@ def test_shares_keep_their_sum_and_take_any_ratio():
     assert_allclose(np.log(value[1:] / value[0]), np.log([3.0, 4.0]) + [0.4, -1.0], rtol=1e-12)
 
 
+def test_numbers_of_kinds_losses_and_starts_are_those_given_in_single_precision_too():
+    """They are no arrays, and double precision may be set later."""
+    with jax.enable_x64(False):
+        assert (dr.interval(0.1, 0.3).low, dr.interval(0.1, 0.3).high) == (0.1, 0.3)
+        prior = dr.prior(dr.real(0.7), (1.2, 0.1), 0.3)
+        assert (prior.kind.spread, prior.mean, prior.deviation) == (0.7, (1.2, 0.1), (0.3,))
+        assert (dr.huber(1.1).at, dr.student(4.7).nu) == (1.1, 4.7)
+        kinds = (dr.positive, dr.direction, dr.rotation, dr.inertia, dr.shares)
+        assert [kind(0.7).spread for kind in kinds] == [0.7] * 5
+        with pytest.raises(ValueError, match=r"interval\(0.3, 0.1\): expected low < high"):
+            dr.interval(0.3, 0.1)
+        pair = dr.scene({"p": dr.Body(None, mass=1.0, inertia=1.0, x=(0.0, 0.0))})
+        record = dr.Record({"t": [0.1, 0.2], "p.x": np.zeros((2, 2))}, start=0.1)  # not after the first time
+        assert sysid.make_problem(*pair, [record], free={"p.x": dr.real()}).runs[0].start == 0.1
+
+
 def test_rotation_is_a_turn_of_the_start():
     kind, q = dr.rotation(), jnp.array([0.6, 0.8, 0.0, 0.0])
     value = kind.value(jnp.array([0.0, 0.0, 0.3]), q)

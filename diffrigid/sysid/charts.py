@@ -12,6 +12,7 @@ from jax import Array
 from diffrigid import so2, so3
 from diffrigid.convert import coefficient
 from diffrigid.linear import matmul
+from diffrigid.sysid.free import as_given
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def direction(spread: float = 0.5) -> Chart:
         >>> round(float(jnp.hypot(*down)), 6)
         9.81
     """
-    spread, expected = float(coefficient("spread", spread)), "a direction that is not zero"
+    spread, expected = as_given(coefficient, "spread", spread), "a direction that is not zero"
     return Chart("direction", _direction_size, _turned_vector, spread, np.any, expected)
 
 
@@ -78,7 +79,7 @@ def rotation(spread: float = 0.5) -> Chart:
         >>> dr.rotation().value(jnp.array([np.pi / 2]), jnp.array([1.0, 0.0])).round(6).tolist()
         [0.0, 1.0]
     """
-    spread, expected = float(coefficient("spread", spread)), "an orientation that is not zero"
+    spread, expected = as_given(coefficient, "spread", spread), "an orientation that is not zero"
     return Chart("rotation", _rotation_size, _turned_orientation, spread, np.any, expected)
 
 
@@ -101,7 +102,7 @@ def inertia(spread: float = 0.3, *, principal: bool = False) -> Chart:
     """
     if not isinstance(principal, bool):
         raise ValueError(f"inertia: principal is {principal!r}, expected True or False")
-    spread, expected = float(coefficient("spread", spread)), "that of a body with thickness; else principal=True"
+    spread, expected = as_given(coefficient, "spread", spread), "that of a body with thickness; else principal=True"
     if principal:
         return Chart("inertia", _moments_size, _scaled_inertia, spread, np.any, "an inertia that is not zero")
     return Chart("inertia", _inertia_size, _physical_inertia, spread, _has_thickness, expected)
@@ -121,7 +122,7 @@ def shares(spread: float = 0.5) -> Chart:
         >>> masses.round(6).tolist()
         [0.5, 1.5]
     """
-    spread, expected = float(coefficient("spread", spread)), "numbers above zero, whose sum is kept"
+    spread, expected = as_given(coefficient, "spread", spread), "numbers above zero, whose sum is kept"
     return Chart("shares", _shares_size, _same_sum, spread, _all_positive, expected)
 
 

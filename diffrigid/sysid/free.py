@@ -15,6 +15,7 @@ A kind of parameter is a frozen record with the verbs
 condition on the value, such as directions, are in `charts`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,7 +114,7 @@ def interval(low: float, high: float) -> Free:
         >>> dr.interval(0, 2).value(np.array([-50.0, 0.0, 50.0])).round(3)  # of what is fitted, which has no bounds
         array([0., 1., 2.])
     """
-    low, high = (float(known_number(f"interval: {end}", value)) for end, value in (("low", low), ("high", high)))
+    low, high = as_given(known_number, "interval: low", low), as_given(known_number, "interval: high", high)
     if not low < high:
         raise ValueError(f"interval({low}, {high}): expected low < high")
     return Free(low=low, high=high)
@@ -129,7 +130,7 @@ def positive(spread: float = 0.5) -> Free:
         >>> dr.positive().value(np.array([-50.0, 0.0, 1.0])).round(3)  # exp of what is fitted
         array([0.   , 1.   , 2.718])
     """
-    return Free(low=0.0, spread=float(coefficient("spread", spread)))
+    return Free(low=0.0, spread=as_given(coefficient, "spread", spread))
 
 
 def real(spread: float = 0.5) -> Free:
@@ -142,7 +143,7 @@ def real(spread: float = 0.5) -> Free:
         >>> dr.real(spread=0.1).draw(np.array([3.0, 4.0]), np.random.default_rng(0)).round(2)  # a random start
         array([3.04, 3.95])
     """
-    return Free(spread=float(coefficient("spread", spread)))
+    return Free(spread=as_given(coefficient, "spread", spread))
 
 
 def each(kind: Any) -> Each:
@@ -177,7 +178,18 @@ def prior(kind: Any, mean: Any, deviation: Any) -> Prior:
         raise ValueError(
             f"prior: {means.size} means and {deviations.size} deviations, expected as many, or one for all"
         )
-    return Prior(kind=kind, mean=tuple(means.tolist()), deviation=tuple(deviations.tolist()))
+    given = (tuple(np.asarray(part, float).ravel().tolist()) for part in (mean, deviation))
+    return Prior(kind, *given)
+
+
+def as_given(check: Callable, where: str, value: Any, *more: Any) -> float:
+    """The number itself, if `check(where, value, *more)` of `convert` takes it.
+
+    What that returns is rounded to JAX's type of floats, which may still change, and 0.1 would print as
+    0.10000000149011612.
+    """
+    check(where, value, *more)
+    return float(np.asarray(value))
 
 
 def _sigmoid(z: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.convert import positive
+from diffrigid.sysid.free import as_given
 
 
 @dataclass(frozen=True)
@@ -83,4 +84,4 @@ def student(nu: float = 4.0) -> Student:
 
 
 def _above_zero(name: str, value: Any) -> float:
-    return float(positive(name, value, "it counts standard deviations or degrees of freedom"))
+    return as_given(positive, name, value, "it counts standard deviations or degrees of freedom")

@@ -11,6 +11,7 @@ from diffrigid.controls import controlled
 from diffrigid.convert import known_number
 from diffrigid.state import State
 from diffrigid.sysid.columns import Series, check_mapping, columns, odd_speeds
+from diffrigid.sysid.free import as_given
 from diffrigid.sysid.sensors import Channel
 from diffrigid.tables import moment
 from diffrigid.world import World, check
@@ -103,7 +104,7 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
     if unknown := set(own) - set(names):
         raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
     first = min(float(s.t[0]) for s in series)
-    start = first if record.start is None else float(known_number(f"{where}.start", record.start))
+    start = first if record.start is None else as_given(known_number, f"{where}.start", record.start)
     if start > first:
         raise ValueError(
             f"{where}: start is {moment(start)} s, after the first measured time {moment(first)} s: make it earlier"
