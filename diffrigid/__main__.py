@@ -23,7 +23,7 @@ TRUTH = {"restitution": 0.8, "middle.mass": 2.0, "left.v": (2.0, 0.1)}
 LEAD = """
 Two identifications by diffrigid, from positions and angles alone: a measured one, whose answer can be
 compared with what others published, and a synthetic one, whose answer is known. Both are least squares with
-exact derivatives through the impacts. This file needs nothing but itself.
+exact derivatives through the impacts. This file is self-contained.
 """
 
 DROP_TEXT = """
@@ -53,8 +53,8 @@ times too narrow. The intervals here come from leaving out each drop in turn (ja
 Student's t with 7 degrees of freedom).
 
 The floor comes out more than 3 mm below that under squares at rest. For a corner it stands for more than
-the floor: one that is rounded, or yields, strikes later than a sharp one. Of 134 recordings where it can be
-told, 78 lack a frame at the first impact, and no model of an impact fits them; the eight here are the first
+the floor: one that is rounded, or yields, strikes later than a sharp one. Among 134 recordings where it can be
+seen, 78 lack a frame at the first impact, and no model of an impact fits them; the eight here are the first
 of those that are complete (diffrigid.data says how they were chosen).
 """
 

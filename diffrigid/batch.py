@@ -38,22 +38,22 @@ def rollout_batch(
     world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, controls: Any = None,
     chunk: int | None = None, memory: int = MEMORY,
 ) -> State:  # fmt: skip
-    """States of B worlds, from `world` and `state`, any leaf of which may have a leading batch axis.
+    """States of B worlds; any leaf of `world` and `state` may have a leading batch axis.
 
     States that are off their joints are brought onto them first, as in `rollout`.
 
     Args:
         dt: [s].
         steps: T >= 1.
-        final_only: return only the last state, (B, N, ...); else all of them, (B, T+1, N, ...).
+        final_only: return only the last state, (B, N, ...), instead of all of them, (B, T+1, N, ...).
         controls: values that forces with a `control` add, by its name; held over each step: (T, D or A) for all
             worlds, or (B, T, D or A).
         chunk: worlds that run together; default: as many as fit the cache and `memory`.
         memory: [bytes] that reverse mode may use for saved states on each device. If a batch needs more, only the start
             of each chunk is kept and the chunk is recomputed; if one chunk needs more, see `rollout`.
 
-    All JAX devices share the work, those of other processes too: then every process makes the same call,
-    and the result lies where it was computed (`jax.experimental.multihost_utils.process_allgather` brings it together).
+    All JAX devices share the work, including those of other processes: then every process makes the same call, and the
+    result stays where it was computed (`jax.experimental.multihost_utils.process_allgather` brings it together).
 
     Raises:
         ValueError: no leaf has a batch axis, or two differ in its length; dt <= 0; steps, chunk or memory < 1;

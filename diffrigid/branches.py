@@ -14,7 +14,7 @@ from diffrigid.devices import on_cpu
 def any_world(flags: Array) -> Array:
     """Whether any flag is set in any of the worlds, a bool: the condition of branches and loops.
 
-    Under `jax.vmap`, too, it is over all the worlds: else every branch would become a choice between two results that
+    It is over all worlds under `jax.vmap` too: otherwise every branch would become a choice between two results that
     are both computed, which is far slower.
     """
     return jnp.any(flags)

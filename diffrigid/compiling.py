@@ -63,7 +63,7 @@ LASTING = Options(PLAINER | ({} if LEVEL in os.environ.get("XLA_FLAGS", "") else
 VECTORS = {"xla_cpu_prefer_vector_width": 512}
 WIDE = Options(VECTORS)
 # A loop whose step accesses fewer bytes is one function; short loops over the worlds are not written out one by one
-# before they are vectorised, as LLVM else does up to some hundred.
+# before they are vectorised, as LLVM otherwise does up to a few hundred.
 SPEED = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000,-unroll-full-max-count=8",
     *(f"--{option}={value}" for option, value in VECTORS.items()),
@@ -123,8 +123,8 @@ def compile_for_speed() -> None:
 
     A loop, and so a rollout, is then one function, where XLA up to JAX 0.11 makes one of every few operations: two to
     eight times as fast for a single world, 1.5 to 4 times for a batch. Compiling takes about as long as JAX by itself
-    needs in 2D, and 1.6 times (a rollout) to three times (a gradient) as long in 3D. A fit, most of whose time is that
-    of compiling, is better off without. Sets XLA_FLAGS, which JAX reads when it is first used.
+    needs in 2D, and 1.6 times (a rollout) to three times (a gradient) as long in 3D. Do not use it for `fit`, which
+    spends most of its time compiling. Sets XLA_FLAGS, which JAX reads when it is first used.
 
     Raises:
         RuntimeError: JAX was in use already, so that it did not read XLA_FLAGS.

@@ -38,7 +38,7 @@ def as_controls(
 
     Args:
         steps: (T,), or () for one step.
-        batch: trailing axes that a control may have; those without are given as many of length one.
+        batch: trailing axes that a control may have; a control without them gets axes of length one.
         axis: as in `controlled`.
 
     Raises:

@@ -78,8 +78,8 @@ class GroundFriction:
     """Dry friction of bodies that slide on level ground, seen from above: pucks, cars, billiard balls. In 2D.
 
     F = -c v and tau = -c arm^2 w with c = friction m g / sqrt(v^2 + arm^2 w^2 + slow^2), so that a spin makes a slide
-    longer, and both end together, within the step by a displacement of the order of friction g dt^2. Of several records
-    on one body the forces add. What pushes a body with less than `friction m g` makes it creep, by up to `slow`.
+    longer, and both end together, within the step by a displacement of the order of friction g dt^2. Several records on
+    one body add up. A body pushed with less than `friction m g` creeps, at most at the speed `slow`.
     Differentiable everywhere, also at rest; a `scene` in 3D refuses it.
     Source: Howe and Cutkosky, Int. J. Robotics Research 15 (1996) 557, the ellipsoid as limit surface.
 
@@ -121,7 +121,7 @@ class GroundFriction:
         return Wrench(F=-drag[:, None] * v, tau=-(drag * arm**2)[:, None] * w)
 
     def within(self, span: Array) -> "GroundFriction":
-        """The force for a step of length span (*batch) [s]: else it would throw bodies to and fro as they stop."""
+        """The force for a step of length span (*batch) [s]: otherwise bodies would oscillate as they stop."""
         return replace(self, slow=jnp.maximum(self.slow, 0.5 * self.friction * self.g * span))
 
 

@@ -90,8 +90,8 @@ def _sums(values: Array, index: tuple[tuple[int, ...], ...], axis: int = 0) -> A
 def sum_rows(values: Array, index: tuple) -> Array:
     """Sums of rows of values (M, ...), for an index known when tracing, (len(index), ...). An index of M adds 0.
 
-    Where each sum is over a run of rows and one run follows the other, it is unrolled. Else rows are gathered, padded
-    to the largest number that any sum has: forward that is one fused loop, where a scatter is a serial one.
+    Where each sum is over a run of rows and one run follows the other, it is unrolled. Otherwise rows are gathered,
+    padded to the largest number that any sum has: forward that is one fused loop, where a scatter is a serial one.
     """
     distinct = tuple(dict.fromkeys(index))
     runs = [tuple(i for i in row if i < len(values)) for row in distinct]

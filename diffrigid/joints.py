@@ -36,11 +36,11 @@ class Revolute:
     """A hinge: two points stay together and, in 3D, two axes stay parallel.
 
     Anchors and axes are in body axes, from the centre of mass; for `b=None`, the world, anchor_b is a world
-    point. What is not given of b is taken from the initial poses of the bodies.
+    point. Anchors and axes of b that are not given follow from the initial poses of the bodies.
 
     The angle is that of a relative to b, counter-clockwise in 2D and right-handed about the axis in 3D. For angles as a
     robot has them, the child comes first: `Revolute("forearm", "arm")`. In 3D or with limits it is 0 in the initial
-    poses; else it is the angle of a less that of b.
+    poses; otherwise it is the angle of a minus that of b.
 
     Example:
         >>> door = dr.Body(None, mass=9.0, inertia=0.6, x=(0.4, 0.0))
@@ -72,7 +72,7 @@ class Revolute:
         return jnp.concatenate([apart, jnp.stack([dot(so.rotate(b.q, t), along) for t in tangents(self.axis_b)])])
 
     def coordinate(self, so: ModuleType, a: Pose, b: Pose) -> Array:
-        """Angle of a against b about the axis, (*batch) [rad], within pi of the middle of its limits, else of 0."""
+        """Angle of a relative to b about the axis, (*batch) [rad], within pi of the middle of its limits, or of 0."""
         turned, zero = so.difference(b.q, a.q), self.zero
         middle = middle_of(*(None if limit is None else jnp.asarray(limit) for limit in (self.lower, self.upper)))
         if middle is not None:

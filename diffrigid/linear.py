@@ -13,7 +13,7 @@ from diffrigid.numerics import safe_divide
 
 UNROLLED = 6  # rows of a matrix, up to which its elimination is unrolled
 
-# Else a GPU rounds factors in single precision to ten bits.
+# Otherwise a GPU rounds factors in single precision to ten bits.
 matmul = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
@@ -37,7 +37,7 @@ def _eliminated(matrix: Array, right: Array) -> Array:
     system = jnp.concatenate([matrix, right[:, None]], axis=1)
     if len(matrix) <= UNROLLED:
         return _written_out(system)
-    # Not fused, for else all that the matrix is made of is computed in the order of the transposed one.
+    # Not fused; otherwise everything that the matrix is made of is computed in the order of the transposed one.
     system = unfused(opaque_true(right), lambda system: system, system)
     # What elimination makes of the right side beside the matrix needs no permutation. With a row below the system is
     # square: libraries for GPUs take a batch of these at once, others one by one.

@@ -102,7 +102,7 @@ def safe_sqrt(x: Array) -> Array:
     """Square root; 0 with zero derivative for x <= 0 (the derivative of sqrt at 0 is infinite), or just above.
 
     Two results of one program that both need x may each have a copy of it, which XLA rounds differently: 0 in one,
-    1e-17 in the other. What stands in for an x that is not positive has to be tiny: else the root of one copy would
+    1e-17 in the other. The stand-in for an x that is not positive has to be tiny: otherwise the root of one copy would
     be 1, and of the other 0.
     """
     least = _least(x)
@@ -112,7 +112,7 @@ def safe_sqrt(x: Array) -> Array:
 
 @jax.custom_jvp
 def cos_sin(phi: Array) -> tuple[Array, Array]:
-    """Cosine and sine, to rounding for |phi| up to some thousand turns.
+    """Cosine and sine, to rounding for |phi| up to a few thousand turns.
 
     XLA calls the scalar library for them on a CPU, which is slow. Reduction to |r| <= pi / 2 in three parts of pi
     (Cody & Waite 1980), then Taylor's series by Horner's rule, whose remainder there is below rounding after twelve

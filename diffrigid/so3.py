@@ -197,7 +197,7 @@ def free_turn(inverse: Array, q: Array, L: Array, span: Array) -> tuple[Array, A
     With l = R^T L and any number c, a body of inverse inertia I^-1 is carried by c L, and turns in its own axes by
     u = (I^-1 - c) l, because in Euler's equations l' = l x w the part along l has no effect. With 1/c between the two
     moments that differ least, u is the spin of a symmetric top about its axis e, constant, and the whole is exact
-    (Goldstein, Classical Mechanics, section 5.6). Else it is `turn_series` of u, with an error of (u s)^7 / 5040.
+    (Goldstein, Classical Mechanics, section 5.6). Otherwise it is `turn_series` of u, with an error of (u s)^7 / 5040.
     Where u turns by more than RESOLVED within the step, that series would diverge: there the body is the symmetric top
     whose moment across e is that in the direction of l, so that it also spins right about any principal axis. Its
     energy is between the least and the most that a turn about e leads to.

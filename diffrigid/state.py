@@ -98,7 +98,10 @@ def kinetic_energy(bodies: Bodies, state: State) -> Array:
 
 
 def momentum(bodies: Bodies, state: State) -> Array:
-    """Linear momentum of each body, m v, (N, D, *batch) [kg m/s]. Raises as `kinetic_energy`.
+    """Linear momentum of each body, m v, (N, D, *batch) [kg m/s].
+
+    Raises:
+        ValueError: a state that is not of these bodies, or of many times.
 
     Example:
         >>> dr.momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()
@@ -110,6 +113,9 @@ def momentum(bodies: Bodies, state: State) -> Array:
 
 def angular_momentum(bodies: Bodies, state: State) -> Array:
     """Angular momentum of each body about the world origin, x * p + L, (N, A, *batch) [kg m^2/s].
+
+    Raises:
+        ValueError: a state that is not of these bodies, or of many times.
 
     Example:
         >>> dr.angular_momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()  # no spin: an arm
@@ -159,7 +165,14 @@ def material_point(state: State, body: int, point: Any) -> Array:
 
 
 def material_velocity(state: State, body: int, point: Any) -> Array:
-    """World velocity of a point fixed to a body, v + w x (R r_b), (D, *batch) [m/s]. Arguments as above.
+    """World velocity of a point fixed to a body, v + w x (R r_b), (D, *batch) [m/s].
+
+    Args:
+        body: index of the body.
+        point: (D, *batch) [m], body axes, from the centre of mass.
+
+    Raises:
+        ValueError: a state of many times, no such body, a point of another dimension.
 
     Example:
         >>> spinning = dr.replace(state, w=jnp.array([[5.0]]))
@@ -176,7 +189,8 @@ def _aligned(state: State, body: int, point: Any) -> tuple[State, Array]:
     point, count, dim = jnp.asarray(point), len(state.x), 2 if state.q.shape[1] == 2 else 3
     _refuse_times(state, dim, count, "jax.vmap(lambda state: dr.material_point(state, 0, point))(trajectory.state)")
     if not isinstance(body, jax.core.Tracer) and not (isinstance(body, int | np.integer) and -count <= body < count):
-        raise ValueError(f"body is {body!r}: expected the number of a body, from 0 to {count - 1}, as in world.names")
+        fix = f"world.names.index({body!r})" if isinstance(body, str) else "as in world.names"
+        raise ValueError(f"body is {body!r}: expected the number of a body, from 0 to {count - 1}, {fix}")
     if point.shape[:1] != (dim,):
         raise ValueError(f"point has shape {point.shape}: expected ({dim},), and axes of a batch behind")
     rank = max(batch_rank(state), jnp.ndim(point) - 1)

@@ -59,8 +59,8 @@ def rollout(
 ) -> Trajectory:  # fmt: skip
     """Trajectory from `state`, at every step or at given times.
 
-    Where joints do not hold in `state`, the bodies are moved onto them first, and struck by the impulses that make
-    their velocities fit.
+    If `state` violates the joints, poses are projected onto them first, and impulses make the velocities consistent
+    with them.
 
     Args:
         dt: [s] length of a step, or with `times` the longest step allowed.
@@ -228,7 +228,7 @@ ROLLOUT = tuple(compiled(options, "counts", "memory")(_rollout) for options in O
 
 
 def options_for(inputs: tuple, steps: int, worlds: int) -> int:
-    """Index of the OPTIONS to compile with: for few or small steps those that compile sooner, else the faster ones.
+    """Index of the OPTIONS to compile with: for few or small steps those that compile sooner, if not the faster ones.
 
     For a crowd or a GPU, which would run slower, and where JAX was told to compile for speed, those of JAX; also for
     traced inputs, which may not have options of their own: reverse mode makes a part of another program of them.

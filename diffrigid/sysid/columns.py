@@ -30,7 +30,7 @@ class Series:
 def columns(
     world: World, observations: Any, observe: Mapping[str, Any], where: str = "observations"
 ) -> tuple[tuple[Series, ...], dict[str, Channel], tuple[Series, ...]]:
-    """Columns of a record, what each observes, and the controls among them, which have the names given by forces.
+    """Measured columns of a record, what each observes, and its columns that are controls, by their names in forces.
 
     Args:
         observations: a mapping or a table (anything with `columns`), or the path of a CSV file. "t" (K,) [s], and by

@@ -68,11 +68,11 @@ def information(linear: Linear) -> np.ndarray:
 
 
 def sandwich(linear: Linear) -> Uncertainty:
-    """Covariance by the scores of records: right where the model is wrong, or residuals correlate within a record.
+    """Covariance from the scores of records: right where the model is wrong, or residuals correlate within a record.
 
     Leaves out each record in turn, to first order; with one record, each of 20 pieces of its time, which is right if
-    residuals of different pieces are independent; likewise where one record alone determines some number. What a
-    single piece determines has the variance of `from_jacobian`. Source: jackknife of clusters, CR3 of Bell and
+    residuals of different pieces are independent; likewise where one record alone determines some number. Numbers that
+    a single piece determines have the variance of `from_jacobian`. Source: jackknife of clusters, CR3 of Bell and
     McCaffrey 2002.
 
     Example:
@@ -117,7 +117,7 @@ def joint_covariance(linear: Linear, record: int, shared: np.ndarray) -> np.ndar
     """Covariance (a + b, a + b) of the shared numbers and a record's own, given that of the shared ones.
 
     The own numbers are those of the best fit to the shared ones, and follow them with the slope -D B^T A, where A and B
-    are the Jacobians by both and D = (B^T B)^-1; their own scatter is D.
+    are the Jacobians with respect to both and D = (B^T B)^-1; their own scatter is D.
     """
     shared_part, own = np.split(linear.slopes[record], [linear.shared], axis=1)
     D = inverse(own.T @ own)
@@ -180,7 +180,7 @@ def _clusters(linear: Linear) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def eliminated(linear: Linear, record: int) -> tuple[np.ndarray, np.ndarray]:
-    """Project a record's own numbers out of its Jacobian by the shared numbers (m, a) and out of its residuals (m,)."""
+    """Project a record's own numbers out of its Jacobian of the shared numbers (m, a) and out of its residuals (m,)."""
     J, r = linear.slopes[record], linear.rows[record]
     own = J[:, linear.shared :]
     if own.shape[1] == 0:

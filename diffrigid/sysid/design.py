@@ -117,14 +117,15 @@ def best_launch(
     """The launch whose record would give the narrowest intervals, by gradients from several starts.
 
     Args:
-        vary: what can be chosen of the initial state or the world, as `free`: {"ball.v": interval(-3, 3)}. What is
-            free too, as the velocity of a launch by hand, is chosen, but not known.
-        target: the one of `free` to learn, while the others are unknown too; default all of them (D-optimal).
+        vary: what can be chosen of the initial state or the world, as `free`: {"ball.v": interval(-3, 3)}. A parameter
+            may be both varied and free, such as the velocity of a launch by hand: it is planned, but still has to be
+            fitted.
+        target: the free parameter to learn, while the others are unknown too; default all of them (D-optimal).
         starts: the first is the launch of `state`, the others are random.
         steps: along the gradient, of each start.
         seed: of the random starts.
 
-    The gradient of the information is by central differences of exact Jacobians, all launches in one batch.
+    The gradient of the information comes from central differences of exact Jacobians, all launches in one batch.
 
     Raises:
         ValueError: the target is not free; starts or steps < 1; what `expected_intervals` does not take.

@@ -100,7 +100,7 @@ def reduced(rows: np.ndarray) -> np.ndarray:
 
 
 def _first_record(linear: Linear, numbers: int) -> np.ndarray:
-    """Jacobian by the shared numbers and those of the first record, with the rows of all records.
+    """Jacobian with respect to the shared numbers and those of the first record, with the rows of all records.
 
     The own numbers of the other records are projected out of their rows.
     """
@@ -168,8 +168,8 @@ def whiteness(series: Sequence[np.ndarray]) -> float:
     """Chance (p-value) of autocorrelations as large as those of the residuals in independent noise.
 
     The autocorrelations of n numbers are normal with variance 1 / n about 0; those over 5 lags are summed, over all
-    series. One-sided: errors of a model make neighbours alike, while the fitted numbers make them slightly unlike, so
-    that many short series of noise are not doubted. NaN is left out of the products.
+    series. One-sided: errors of a model make neighbours similar, while the fitted numbers make them slightly
+    dissimilar, so that many short series of noise are not doubted. NaN is left out of the products.
     """
     total, count = 0.0, 0
     for r in series:

@@ -64,7 +64,7 @@ def shown(
 ) -> dict[str, np.ndarray]:
     """Poses and velocities at `start` [s] by path, (size,), NaN where the next rows do not show them.
 
-    Of columns that read the position or the angle of a body or a joint, or enough markers on a body.
+    From columns that read the position or the angle of a body or a joint, or from enough markers on a body.
     """
     out: dict[str, np.ndarray] = {}
     for body, (t, x, q) in _marked(world, series, channels, start).items():

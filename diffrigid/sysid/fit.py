@@ -65,18 +65,19 @@ def fit(
         observations: "t" [s] and columns "body.x", "body.v", "body.angle", "body.q", "body.w", arrays of K rows, or a
             table or CSV file with columns "t", "body.x[0]", ...; NaN is missing. A column with times of its own is a
             pair (t, values). The first time is that of `state`. A column with the name of a `control` of a force is
-            what acts, each value until the next. A list of such, or of `Record`, is fitted together.
+            that control, each value held until the next. A list of such observations, or of `Record`, is fitted
+            together.
         free: what may vary: a path (see `diffrigid.paths` and `diffrigid.sysid.sensors`), or a tuple of paths that
             share one value. `each(kind)` gives every record its own, which begins as its first rows show it.
         starts: the first is at the values of `world` and `state`, the others are random.
         dt: [s] longest step; default 1.1 times the median of the intervals of t, but no more than 0.02 s where bodies
             touch, have joints, or forces vary.
-        noise: standard deviation of each column, in its unit, a number or an array like the column; what is not given
-            is estimated from the residuals.
+        noise: standard deviation of each column, in its unit, a number or an array like the column; noise that is not
+            given is estimated from the residuals.
         observe: what a column observes if its name does not say so: {"tip": Marker("rod", point=(0.3, 0))};
             None leaves it out.
-        widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets
-            starts that miss an impact find it. Default: that of the world, 0 unless it was given another.
+        widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets starts that
+            miss an impact find it. Default: the width of the world, 0 unless set.
         windows: [s] of each record from its start, one fit after the other: (0.5, 1, 2, inf) leads into a long one.
         loss: `diffrigid.sysid.squares()`, `dr.huber()` or `dr.student()`.
         solver: default Levenberg-Marquardt; for many numbers `diffrigid.sysid.first_order(optax.adam(1e-2))` or
@@ -85,7 +86,7 @@ def fit(
         iterations: at most, for each width and window; default 60, for other solvers the number they were made
             with. A fit that has not converged by then says so.
         seed: of the random starts.
-        resume: an earlier Fit, or what `load_fit` read: the first start is there.
+        resume: an earlier Fit, or the result of `load_fit`: the first start is there.
         progress: print a line as it goes; default: where the output is a terminal or a notebook.
 
     Interrupting it returns the best so far.
@@ -264,7 +265,7 @@ def _all_noise(problem: Problem) -> dict[str, float]:
 def _refuse_blind(problem: Problem, linear: Linear, residuals: Sequence[dict[str, np.ndarray]]) -> None:
     """Raise ValueError for a parameter that no residual depends on, instead of a number with an infinite interval.
 
-    Where the fit failed, that comes first: a motion far from the measured one tells nothing of what is seen.
+    Where the fit failed, that comes first: a motion far from the measured one says nothing about what is seen.
     """
     sizes = sum((slopes**2).sum(0) for slopes in linear.slopes)
     for slot, rows in pieces(problem.slots):

@@ -28,7 +28,7 @@ STILL = 1e-10  # [-] relative decrease of the cost at which it ends
 def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Callable:
     """Steps of an optimiser of optax on all starts at once: first_order(optax.adam(1e-2)).
 
-    The number of steps is `iterations` of `fit`, or else `steps`.
+    The number of steps is `iterations` of `fit` if given, otherwise `steps`.
 
     Raises:
         ValueError: steps < 1.
@@ -55,7 +55,7 @@ def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Ca
 def lbfgs(steps: int = 200, memory: int = 10) -> Callable:
     """L-BFGS of optax, each start on its own, with steps halved until they gain (Armijo).
 
-    The number of steps is at most `iterations` of `fit`, or else `steps`.
+    The number of steps is at most `iterations` of `fit` if given, otherwise `steps`.
 
     Args:
         memory: earlier steps and gradients, of each start, from which the curvature is taken.

@@ -86,7 +86,9 @@ def _notes(
     exact = [name for name, sigma in problem.noise.items() if sigma <= least_noise(problem, name)]
     if exact:
         names = ", ".join(exact)
-        notes.append(f"residuals of {names} are rounding, as of simulated data without noise: intervals mean nothing")
+        notes.append(
+            f"residuals of {names} are at rounding level, as for simulated data without noise: intervals mean nothing"
+        )
     tested = [column for record in residuals for name, column in record.items() if name not in exact]
     series = [r for column in tested for r in column.T if np.isfinite(r).any()]
     lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
@@ -127,7 +129,7 @@ def unseen_of(blind: Sequence[Blind], rows: slice) -> np.ndarray:
 def interval_of(
     slot: Slot, z: np.ndarray, covariance: np.ndarray, about: Any, quantile: float, unseen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Value, and low and high end of its interval: by the map of z where it acts number by number, else to first order.
+    """Value, low and high end of its interval: by the map of z if it acts number by number, otherwise to first order.
 
     Infinite where a value changes along `unseen` (n, k); changes without these have an interval.
     """

@@ -158,7 +158,7 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
 def update(
     loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
 ) -> tuple[Progress, Numbers]:
-    """Accept the trial where it costs less, else keep the old point and raise the damping; return the next trial too.
+    """Accept the trial where it costs less, otherwise keep the old point and raise the damping; also the next trial.
 
     A start is accepted or not as a whole; where no shared number moves, each record by itself.
     """

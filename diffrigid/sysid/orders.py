@@ -61,8 +61,8 @@ def alike(orders: Orders) -> list[tuple[int, ...]]:
 def in_words(orders: Orders, starts: int) -> str:
     """One line, "5 of 8 starts: cue-ball, ball-wall; 3 of 8: cue-wall"; "" where nothing strikes anything.
 
-    Of several records, it is about the first in which the starts differ. Of more `starts` than there are orders, those
-    are the best.
+    With several records, the line is about the first one in which the starts differ. With more `starts` than orders,
+    the orders are those of the best.
     """
     groups = alike(orders)
     if not any(any(order) for order in orders):

@@ -25,7 +25,8 @@ class Record:
 
     Args:
         observations: as of `fit`.
-        state: its own initial state; default that of `fit`, with what is free by `each` as the first rows show it.
+        state: its own initial state; default that of `fit`, with parameters that are free by `each` as its first rows
+            show them.
         world: its own; default that of `fit`.
         start: [s] time of the initial state; default the first time of its columns.
         noise: standard deviations of its columns, numbers or arrays like the columns; default those of `fit`.

@@ -58,7 +58,7 @@ class Fit:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """What was fitted, with 95 % intervals; what all records share first, then what each has of its own."""
+        """Fitted parameters with 95 % intervals: first those that all records share, then those of each record."""
         return self.summary.parameters
 
     @property
@@ -73,10 +73,10 @@ class Fit:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion. Of two models of the same records that with the smaller one predicts better.
+        """Akaike's criterion: of two models of the same records, the one with the smaller value should predict better.
 
-        2 k - 2 log L, with k the numbers that were found, those of the noise too, and L the likelihood. `costs` do not
-        tell models apart where the noise is estimated: each is then in units of its own residuals.
+        2 k - 2 log L, with k the number of fitted numbers, including those of the noise, and L the likelihood. `costs`
+        cannot compare models where the noise is estimated: each is then in units of its own residuals.
 
         Raises:
             ValueError: the loss is not that of normal noise.
@@ -103,7 +103,7 @@ class Fit:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the data cannot tell, and why not to believe the intervals; the lines with "!" under the table."""
+        """What the data cannot determine, and why not to believe the intervals; the lines with "!" under the table."""
         return self.summary.notes
 
     @property
@@ -158,9 +158,9 @@ class Fit:
     def score(self, observations: Any, starts: int = 1, seed: int = 0) -> dict[str, float]:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
 
-        Numbers that each record has for itself are fitted anew, from several starts if asked for, the first from its
-        state, or else from its first rows, and where they show none from the state of the first record of the fit, with
-        a warning if that ends far off; for a record that was fitted, from the values found.
+        Parameters that each record has of its own are fitted anew. The first start is the `state` of the record if it
+        has one, otherwise the state that its first rows show, otherwise (with a warning if the score is poor) the
+        fitted state of record 0. A record that was part of the fit starts from its fitted values.
 
         Args:
             observations: one record or several, as `fit` takes them.
@@ -209,12 +209,12 @@ class Fit:
     def derived(self, fn: Callable[[World, State], Any], record: int = 0) -> Parameter:
         """A number, or an array, that follows from the fitted scene of a record, with its 95 % interval.
 
-        The interval is symmetric, to first order in the errors of the fit, and by the same covariance and quantile as
-        those in the table (of `with_intervals` too). It is infinite where the data do not determine the number.
+        The interval is symmetric, to first order in the errors of the fit, and uses the covariance and quantile of
+        those in the table (also after `with_intervals`). It is infinite where the data do not determine the number.
 
         Args:
             fn: of the world and the initial state, in operations of JAX.
-            record: whose scene it is, where records have numbers of their own.
+            record: the one whose scene is used, if records have numbers of their own.
 
         Raises:
             ValueError: there is no such record.

@@ -1,8 +1,9 @@
 """Multiple shooting: a long record cut into short ones, each with an initial state of its own.
 
 Over a short time the motion depends almost linearly on its start; over many impacts it does not, and a fit from a poor
-start fails. What all pieces share is found first, with `each` for their states; then a fit of the whole record with
-growing `windows` starts from there, and ends in one motion without jumps. `fit_in_pieces` does both, or by hand:
+start fails. The numbers that all pieces share are found first, with `each` for their states; then a fit of the whole
+record with growing `windows` starts from there, and ends in one motion without jumps. `fit_in_pieces` does both, or by
+hand:
 
     pieces = segments(world, state, observations, 8)
     own = {"ball.x": each(real()), "ball.v": each(real())}
@@ -40,7 +41,7 @@ LOST = 1.5  # [-] times the noise in pieces: residuals of the whole record beyon
 def segments(world: World, state: State, observations: Any, count: int) -> list[Record]:
     """Cut a record into pieces of equal duration, each of which begins as its first rows show it, the first one too.
 
-    Positions, angles and orientations that are measured, and their velocities; the others are those of `state`.
+    That holds for measured positions, angles and orientations and their velocities; the others are those of `state`.
 
     Args:
         observations: as of `fit`, one record, whose columns are named for what they observe.

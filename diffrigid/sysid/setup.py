@@ -230,7 +230,7 @@ def make_starts(problem: Problem, count: int, seed: int) -> Numbers:
     random = np.random.default_rng(seed)
     drawn = [_numbers(problem, lambda kind, value: kind.draw(value, random)) for _ in range(count - 1)]
     shared_and_own = zip(first_numbers(problem), *drawn, strict=True)
-    # Replicated on all devices, like what a solver returns: else all would be compiled again for that.
+    # Replicated on all devices, like the results of a solver: otherwise everything would be compiled again for those.
     return everywhere(Numbers(*(jax.device_put(np.stack(rows, -1).astype(problem.dtype)) for rows in shared_and_own)))
 
 
