@@ -5,10 +5,11 @@ To read it, in the order of a fit; `fit.py` runs it:
     what was measured     columns.py, records.py, sensors.py, channels.py, times.py
     what is free          free.py, charts.py (kinds), parameters.py (where they are); losses.py
     the problem           setup.py, first_rows.py, problem.py (from z to residuals), clocks.py, points.py (back)
-    solvers               levenberg.py, gradient.py; segments.py for long records
-    how sure              covariance.py, profile.py, sampling.py, diagnosis.py, remarks.py, orders.py
+    solvers               levenberg.py, gradient.py, vector.py (for any other); segments.py for long records
+    how sure              noise.py, covariance.py, profile.py, sampling.py, diagnosis.py, remarks.py, orders.py
     what comes out        result.py, intervals.py, summary.py, table.py
     before measuring      design.py
+    from the shell        command.py
 
 Letters of array axes: K rows of a column, M numbers of a column, R records, S starts, a shared numbers z, b numbers z
 of each record, m residuals.
@@ -27,8 +28,9 @@ from diffrigid.sysid.result import Fit
 from diffrigid.sysid.sampling import sample
 from diffrigid.sysid.segments import fit_in_pieces, jumps, segments
 from diffrigid.sysid.sensors import Channel, Homography, Marker, Pinhole, Separation
-from diffrigid.sysid.setup import jacobian_matrix, make_problem, residual_vector, start_vector, values_at
+from diffrigid.sysid.setup import make_problem
 from diffrigid.sysid.summary import Parameter, load_fit
+from diffrigid.sysid.vector import jacobian_matrix, residual_vector, start_vector, values_at
 
 __all__ = [
     "Channel",

@@ -11,26 +11,18 @@ from diffrigid.convert import at_least_one, numbers
 from diffrigid.state import State
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.columns import check_mapping
-from diffrigid.sysid.covariance import (
-    LEAST_FREE,
-    Intervals,
-    Linear,
-    check_intervals,
-    eliminated,
-    from_jacobian,
-    information,
-    inverse,
-)
+from diffrigid.sysid.covariance import Intervals, Linear, check_intervals, from_jacobian
 from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.intervals import describe
 from diffrigid.sysid.levenberg import INTERRUPTED, Point, Report, cost_of, levenberg
 from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.noise import all_noise, estimated_noise, rescaled
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import pieces
-from diffrigid.sysid.points import by_column, linear_of, row_mask
+from diffrigid.sysid.points import by_column, linear_of
 from diffrigid.sysid.remarks import beside_a_jump, failed, remarks_on, sticking
 from diffrigid.sysid.result import Fit
-from diffrigid.sysid.setup import Problem, fitted_scenes, least_noise, make_problem, make_starts, reach_of, with_noise
+from diffrigid.sysid.setup import Problem, fitted_scenes, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Summary, versions
 from diffrigid.world import World
 
@@ -182,7 +174,7 @@ def finish(
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
     order, alike = np.argsort(costs), costs <= costs[best] + AGREES[0] + AGREES[1] * costs[best]
     summary = Summary(
-        parameters=parameters, noise=_all_noise(problem), costs=costs[order],
+        parameters=parameters, noise=all_noise(problem), costs=costs[order],
         orders=impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum())),
         agree=int(alike.sum()), notes=(*remarks, *notes), seed=seed,
         seconds=time.time() - began, versions=versions(),
@@ -191,75 +183,6 @@ def finish(
         summary, problem, scenes, shared, own, linear, uncertainty, residuals,
         np.asarray(point.z.shared, float)[:, order], loss, tuple(remarks),
     )  # fmt: skip
-
-
-def estimated_noise(problem: Problem, point: Point, loss: Any) -> dict[str, float]:
-    """Standard deviation of the residuals of each column whose noise is not given, at the best start.
-
-    Each column loses as many degrees of freedom as its residuals determine numbers (the trace of its part of the hat
-    matrix), so that the estimate is unbiased. With a robust loss, from the median of the absolute values.
-    """
-    best = int(np.argmin(np.asarray(cost_of(loss, point.residuals))))
-    linear, residuals = linear_of(problem, point, best, loss, True), by_column(problem, point, best)
-    lost, found = _lost(problem, linear), {}
-    for name, sigma in problem.noise.items():
-        free = [r[name] for run, r in zip(problem.runs, residuals, strict=True) if name in r and name not in run.noise]
-        values = np.concatenate([piece[np.isfinite(piece)] for piece in free])
-        share = max(1.0 - lost[name] / max(len(values), 1), LEAST_FREE)
-        size = np.mean(values**2) if isinstance(loss, Squares) else (1.4826 * np.median(np.abs(values))) ** 2
-        found[name] = max(float(sigma * np.sqrt(size / share)), least_noise(problem, name)) if len(values) else sigma
-    return found
-
-
-def _lost(problem: Problem, linear: Linear) -> dict[str, float]:
-    """Number of parameters that the residuals of each column determine: the sum of their leverages."""
-    lost = dict.fromkeys(problem.noise, 0.0)
-    shared = inverse(information(linear))
-    for group in problem.groups:
-        columns = np.concatenate([np.full(w.shape[0] * w.shape[1], n) for n, w in group.data.weights.items()])
-        for k, member in enumerate(group.members):
-            hat = leverages(linear, member, shared)
-            names = columns[row_mask(problem, group, k, len(columns))[0]]
-            for name in lost:
-                lost[name] += float(hat[: len(names)][names == name].sum())
-    return lost
-
-
-def leverages(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
-    """Diagonal of J (J^T J)^-1 J^T for the rows of a record, (m,)."""
-    J = eliminated(linear, record)[0]
-    own = linear.slopes[record][:, linear.shared :]
-    hat = np.einsum("mi,ij,mj->m", J, shared, J)
-    if own.shape[1]:
-        basis = np.linalg.svd(own / np.maximum(np.abs(own).max(0), 1e-300), full_matrices=False)[0]
-        hat = hat + (basis**2).sum(1)
-    return hat
-
-
-def rescaled(problem: Problem, point: Point, noise: Mapping[str, float]) -> Point:
-    """Rescale the residuals and Jacobians of a point to another noise."""
-    residuals, jacobians = [], []
-    for group, r, jac in zip(problem.groups, point.residuals, point.jacobians, strict=True):
-        ratios = []
-        for name, w in group.data.weights.items():
-            change = [
-                1.0 if name in problem.runs[k].noise else problem.noise[name] / noise[name] for k in group.members
-            ]
-            ratios.append(np.broadcast_to(change, (w.shape[0] * w.shape[1], len(change))))
-        ratio = np.concatenate(ratios)
-        ratio = np.concatenate([ratio, np.ones((len(r) - len(ratio), ratio.shape[1]))]).astype(r.dtype)
-        residuals.append(np.asarray(r) * ratio[:, :, None])
-        jacobians.append(np.asarray(jac) * ratio[:, None, :, None])
-    return Point(point.z, tuple(residuals), tuple(jacobians))
-
-
-def _all_noise(problem: Problem) -> dict[str, float]:
-    """Noise by column: estimated, or the median of the given one."""
-    noise = dict(problem.noise)
-    for run in problem.runs:
-        for name in run.channels:
-            noise.setdefault(name, float(np.median(run.noise[name])) if name in run.noise else np.nan)
-    return noise
 
 
 def _refuse_blind(problem: Problem, linear: Linear, residuals: Sequence[dict[str, np.ndarray]]) -> None:

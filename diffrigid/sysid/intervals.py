@@ -25,8 +25,9 @@ from diffrigid.sysid.diagnosis import (
 )
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.noise import least_noise
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
-from diffrigid.sysid.setup import Problem, first_value, least_noise, scene_having, scene_of
+from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
 from diffrigid.sysid.table import BLIND, BOUND
 from diffrigid.world import World
