@@ -15,8 +15,8 @@ import jax
 import numpy as np
 
 import diffrigid as dr
-from diffrigid.__main__ import drop_columns, drop_scene, fit_drops
 from diffrigid.data import square_drops
+from diffrigid.demo import drop_columns, drop_scene, fit_drops
 
 STARTS = 8  # of the initial states of each drop
 

@@ -13,7 +13,8 @@ from pages import Page, parsed
 
 from diffrigid.__main__ import main
 from diffrigid.data import FRAME, square_drops
-from diffrigid.view.report import Curve, chart, row, text_table
+from diffrigid.tables import lined_up
+from diffrigid.view.report import HEADER, Curve, chart, row
 
 PUBLISHED = {  # range that the published values of the square, and their scatter, allow
     "square: restitution": (0.35, 0.6),
@@ -107,7 +108,7 @@ def test_square_drops_fall_freely_after_the_impact():
 def test_tables_show_intervals_to_two_places():
     line = row("e", (0.45405, 0.4016, 0.5066), "-", "0.47")
     assert line[1:3] == ("0.454", "0.402 to 0.507")
-    assert text_table([line]).splitlines()[2] == "e          0.454  0.402 to 0.507  -     0.47"
+    assert lined_up(HEADER, [line])[2] == "e          0.454  0.402 to 0.507  -     0.47"
 
 
 def test_charts_break_at_nan_and_escape_names():

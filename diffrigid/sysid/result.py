@@ -24,7 +24,7 @@ from diffrigid.sysid.points import by_column
 from diffrigid.sysid.records import SAME_TIME, runs, same_data
 from diffrigid.sysid.setup import Problem, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Parameter, Summary
-from diffrigid.sysid.table import html_table, text_table
+from diffrigid.sysid.table import summary_html, summary_text
 from diffrigid.sysid.times import all_times, motion
 from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
@@ -265,10 +265,10 @@ class Fit:
         return self.summary[name]
 
     def __repr__(self) -> str:
-        return text_table(self.summary)
+        return summary_text(self.summary)
 
     def _repr_html_(self) -> str:
-        return html_table(self.summary)
+        return summary_html(self.summary)
 
 
 def checked_fit(fit: Any, what: str) -> Fit:

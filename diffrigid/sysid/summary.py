@@ -13,7 +13,7 @@ import numpy as np
 
 from diffrigid.paths import component
 from diffrigid.sysid.orders import Orders
-from diffrigid.sysid.table import HEADER, html_table, numbers, rows_of, text_table
+from diffrigid.sysid.table import HEADER, numbers, rows_of, summary_html, summary_text
 from diffrigid.tables import lined_up
 
 
@@ -63,10 +63,10 @@ class Summary:
         raise KeyError(f"no parameter {name!r}; there are {[p.name for p in self.parameters]}")
 
     def __repr__(self) -> str:
-        return text_table(self)
+        return summary_text(self)
 
     def _repr_html_(self) -> str:
-        return html_table(self)
+        return summary_html(self)
 
     def rows(self) -> list[dict[str, Any]]:
         """Rows of the table, a dictionary for each number: parameter, value, low, high, unit, note; unrounded."""

@@ -85,12 +85,12 @@ def _others(summary: "Summary") -> str:
     return f" ({', '.join(texts)})" if texts else ""
 
 
-def text_table(summary: "Summary") -> str:
+def summary_text(summary: "Summary") -> str:
     """The table in plain text, with the notes under it."""
     return "\n".join([*lined_up(HEADER, rows(summary)), *below(summary), *(f"! {note}" for note in summary.notes)])
 
 
-def html_table(summary: "Summary") -> str:
+def summary_html(summary: "Summary") -> str:
     """The table for a notebook."""
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in summary.notes)
     lines = "".join(f"<p>{html.escape(line)}</p>" for line in below(summary))

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diffrigid.tables import as_html, digits, labels, lined_up
+from diffrigid.tables import as_html, digits, labels
 from diffrigid.view.play import POLICY, Player
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "truth or published value")
@@ -73,16 +73,6 @@ def row(name: str, values: Sequence[float] | np.ndarray, unit: str, reference: s
     return name, value, f"{low} to {high}", unit, reference
 
 
-def text_table(rows: Sequence[Row]) -> str:
-    """Rows under HEADER, as text."""
-    return "\n".join(lined_up(HEADER, rows))
-
-
-def html_table(rows: Sequence[Row], header: Row = HEADER) -> str:
-    """Rows under a header, as HTML that scrolls if it is wide."""
-    return f'<div class="wide">{as_html(header, rows)}</div>\n'
-
-
 def chart(
     title: str, x_label: str, y_label: str, series: Sequence[Curve], events: Sequence[float] = (), margin: float = 0.0
 ) -> str:
@@ -138,7 +128,7 @@ def matrix(title: str, names: Sequence[str], values: np.ndarray) -> str:
 def _section(section: Section) -> str:
     parts = [f"<section><h2>{html.escape(section.title)}</h2>\n"]
     if section.table:
-        parts.append(html_table(section.table, section.header))
+        parts.append(f'<div class="wide">{as_html(section.header, section.table)}</div>\n')
     if section.player is not None:
         parts.append(f"<figure>{section.player._repr_html_()}</figure>\n")
     parts += [f"<p>{html.escape(paragraph)}</p>\n" for paragraph in section.paragraphs]
