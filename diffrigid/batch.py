@@ -18,7 +18,7 @@ from diffrigid.compiling import compiled, is_for_speed, uncollected
 from diffrigid.controls import as_controls, controlled
 from diffrigid.convert import at_least_one, numbers
 from diffrigid.devices import cut, devices, join, on_cpu, over_devices, pieces_of
-from diffrigid.pytree import map_arrays
+from diffrigid.pytree import Number, map_arrays
 from diffrigid.scan import MEMORY, aligned, final_state, scan_steps
 from diffrigid.shapes import Disc, HalfSpace, Sphere
 from diffrigid.state import State, rotations
@@ -35,8 +35,8 @@ MOST, MOST_FOR_SPEED, MOST_GPU = 2**12, 2**6, 2**20
 
 @uncollected
 def rollout_batch(
-    world: World, state: State, *, dt: Any, steps: int, final_only: bool = False, controls: Any = None,
-    chunk: int | None = None, memory: int = MEMORY,
+    world: World, state: State, *, dt: Number, steps: int, final_only: bool = False,
+    controls: Mapping[str, Any] | None = None, chunk: int | None = None, memory: int = MEMORY,
 ) -> State:  # fmt: skip
     """States of B worlds; any leaf of `world` and `state` may have a leading batch axis.
 

@@ -1,14 +1,17 @@
 """Faces and edges of convex hulls, from concrete corners, in NumPy. V vertices, F faces, T triangles."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 FLAT = 1e-5  # of a shape's size, or rad: less than this counts as flat; above the rounding of float32
 
+Triple = tuple[int, int, int]
 
-def hull_faces(vertices) -> tuple:
+
+def hull_faces(vertices: Any) -> tuple[Triple, ...]:
     """Triangles (i, j, k) of the surface of a convex hull, counter-clockwise seen from outside.
 
     Args:
@@ -22,7 +25,7 @@ def hull_faces(vertices) -> tuple:
     return tuple((f[0], *pair) for f in _flat_faces(corners) for pair in itertools.pairwise(f[1:]))
 
 
-def hull_edges(faces: tuple, vertices=None) -> tuple:
+def hull_edges(faces: tuple[Triple, ...], vertices: Any = None) -> tuple[tuple[int, int], ...]:
     """The distinct edges (i, j), i < j, of a closed surface of triangles, sorted.
 
     With concrete `vertices` (V, 3), without those between two triangles in one plane.
@@ -36,12 +39,12 @@ def hull_edges(faces: tuple, vertices=None) -> tuple:
     return tuple((i, j) for i, j in pairs if _bend(corners, i, j, apex[i, j], apex[j, i]) > FLAT * size)
 
 
-def apexes(faces: tuple) -> dict:
+def apexes(faces: tuple[Triple, ...]) -> dict[tuple[int, int], int]:
     """The third corner of the triangle to the left of each directed side (i, j)."""
     return {side: k for i, j, k in faces for side, k in (((i, j), k), ((j, k), i), ((k, i), j))}
 
 
-def _corners(vertices):
+def _corners(vertices: Any) -> np.ndarray:
     """Concrete vertices of one hull, (V, 3) in double precision."""
     corners = np.asarray(vertices, float)
     if corners.ndim != 2 or corners.shape[1] != 3:
@@ -49,7 +52,7 @@ def _corners(vertices):
     return corners
 
 
-def _bend(corners, i, j, k, l):
+def _bend(corners: np.ndarray, i: int, j: int, k: int, l: int) -> float:
     """How far two triangles (i, j, k), (j, i, l) are from one plane [m].
 
     Measured at the apex nearer to the edge, from the plane of the other triangle: that does not magnify the
@@ -60,11 +63,12 @@ def _bend(corners, i, j, k, l):
     return volume / max(np.linalg.norm(left), np.linalg.norm(right))
 
 
-def _flat_faces(corners):
+def _flat_faces(corners: np.ndarray) -> list[list[int]]:
     """Flat faces of the hull of (V, 3) corners: lists of indices, counter-clockwise seen from outside."""
     hull = ConvexHull(corners)  # of triangles, several of which may lie in one face
     normals, (a, b, c) = hull.equations[:, :3], corners[hull.simplices].transpose(1, 0, 2)
-    heights, found = normals @ corners.T + hull.equations[:, 3:], []
+    heights = normals @ corners.T + hull.equations[:, 3:]
+    found: list[list[int]] = []
     # Larger triangles first: the plane of a face is not taken from three corners almost in line.
     for n in np.argsort(-np.linalg.norm(np.cross(b - a, c - a), axis=1), kind="stable"):
         if not any(set(hull.simplices[n]) <= set(face) for face in found):
@@ -73,7 +77,7 @@ def _flat_faces(corners):
     return found
 
 
-def _around(corners, on, normal):
+def _around(corners: np.ndarray, on: np.ndarray, normal: np.ndarray) -> list[int]:
     """The indices `on` of corners in one plane, in counter-clockwise order about its unit normal."""
     r = corners[on] - corners[on].mean(0)
     u = r[0] / np.linalg.norm(r[0])
@@ -84,7 +88,8 @@ def _around(corners, on, normal):
 # ---- what can be wrong
 
 
-def hull_problem(value):
+def hull_problem(value: np.ndarray) -> str | None:
+    """Say what is wrong with the vertices (V, 3) of a hull; None: nothing."""
     value = value.astype(float)
     apart = np.linalg.norm(value[:, None] - value[None], axis=2)
     if len(twins := np.argwhere(np.triu(apart <= FLAT * extent(value), k=1))):
@@ -98,9 +103,11 @@ def hull_problem(value):
         return f"has point {n} that is no corner of the convex hull: leave it out."
     if len(value) - sum(map(len, faces)) // 2 + len(faces) != 2:  # Euler
         return f"is flat to {FLAT:g} of its size at some edges: leave out the points that stick out least."
+    return None
 
 
-def faces_problem(value, faces):
+def faces_problem(value: np.ndarray, faces: tuple[Triple, ...]) -> str | None:
+    """Say what is wrong with the faces of a hull with vertices `value` (V, 3); None: nothing."""
     if any(len(set(face)) != 3 or not set(face) <= set(range(len(value))) for face in faces):
         return f"must be triples of different indices from 0 to {len(value) - 1}."
     sides = sorted(pair for i, j, k in faces for pair in ((i, j), (j, k), (k, i)))
@@ -111,24 +118,25 @@ def faces_problem(value, faces):
         return "are inside out: reverse each triple, (k, j, i)."
     if abs(volume - expected) > FLAT * expected:
         return f"enclose {volume:.6g} m^3 of {expected:.6g} in the hull: leave them out, and they are found."
+    return None
 
 
-def _volume(corners, faces):
+def _volume(corners: np.ndarray, faces: tuple[Triple, ...]) -> float:
     """Signed volume [m^3] inside a closed surface of triangles."""
     return np.linalg.det(corners[np.array(faces)] - corners.mean(0)).sum() / 6
 
 
-def first(wrong):
+def first(wrong: np.ndarray) -> int | None:
     """Index of the first true entry, None if there is none."""
     return int(np.argmax(wrong)) if wrong.any() else None
 
 
-def extent(corners):
+def extent(corners: np.ndarray) -> float:
     """Longest side [m] of the box around corners (V, D)."""
     return np.ptp(corners, axis=0).max()
 
 
-def triples(faces):
+def triples(faces: Any) -> tuple[Triple, ...]:
     """`faces` as a tuple of triples of int."""
     try:
         rows = np.asarray(faces)

@@ -12,7 +12,8 @@ axes (`batch_rank`, `align`). Records hold data; behaviour is functions.
 """
 
 import dataclasses
-from typing import Any, dataclass_transform
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import numpy as np
@@ -20,6 +21,9 @@ import numpy as np
 replace = dataclasses.replace
 
 Leaf = Any  # a field that a user fills with a number or a tuple, and `scene` with an array
+Number = float | jax.Array
+Vector = Sequence[float] | np.ndarray | jax.Array
+Record = TypeVar("Record")
 
 
 def array(*letters: Any, default: Any = dataclasses.MISSING) -> Any:
@@ -38,7 +42,7 @@ def stacked(letter: str) -> Any:
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(array, static, stacked))
-def pytree(cls):
+def pytree(cls: type[Record]) -> type[Record]:
     """Make `cls` a frozen, keyword-only dataclass and register it with JAX.
 
     The name of the class is a static field: JAX treats records of different classes with equal fields as equal, and
@@ -46,17 +50,18 @@ def pytree(cls):
 
     Two records are equal if all their fields and numbers are. As arrays, they do not hash.
     """
-    cls.__eq__, cls.__hash__ = _equal, None
-    cls.__annotations__ = {**cls.__annotations__, "_class": str}
-    cls._class = dataclasses.field(default=cls.__qualname__, repr=False, kw_only=True, metadata={"static": True})
-    cls = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
-    fields = dataclasses.fields(cls)
+    made: Any = cls
+    made.__eq__, made.__hash__ = _equal, None
+    made.__annotations__ = {**cls.__annotations__, "_class": str}
+    made._class = dataclasses.field(default=cls.__qualname__, repr=False, kw_only=True, metadata={"static": True})
+    made = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(made)
+    fields = dataclasses.fields(made)
     meta = [f.name for f in fields if f.metadata.get("static")]
     data = [f.name for f in fields if f.name not in meta]
-    return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=meta)
+    return jax.tree_util.register_dataclass(made, data_fields=data, meta_fields=meta)
 
 
-def _equal(record, other) -> bool:
+def _equal(record: Any, other: Any) -> bool:
     tree: Any = jax.tree.structure(record)
     if type(record) is not type(other) or tree != jax.tree.structure(other):
         return False
@@ -66,7 +71,7 @@ def _equal(record, other) -> bool:
     return all(map(np.array_equal, *leaves))
 
 
-def map_arrays(fn, node, where: str = "", stack: tuple[str, ...] = ()):
+def map_arrays(fn: Callable, node: Any, where: str = "", stack: tuple[str, ...] = ()) -> Any:
     """Apply `fn(leaf, letters, path)` to every declared array of a record, tuple or dict of records."""
     if node is None:
         return None
@@ -86,52 +91,52 @@ def map_arrays(fn, node, where: str = "", stack: tuple[str, ...] = ()):
     return replace(node, **changed)
 
 
-def batch_rank(node) -> int:
+def batch_rank(node: Any) -> int:
     """Number of trailing batch axes: the largest surplus of a leaf over its declared letters."""
     surplus = [0]
     map_arrays(lambda leaf, letters, _: surplus.append(jax.numpy.ndim(leaf) - len(letters)), node)
     return max(surplus)
 
 
-def align(node, rank: int):
+def align(node: Any, rank: int) -> Any:
     """Give every array `rank` trailing batch axes, of length one where it has none, so that all broadcast."""
 
-    def expand(leaf, letters, _):
+    def expand(leaf: jax.Array, letters: tuple, _: str) -> jax.Array:
         missing = len(letters) + rank - jax.numpy.ndim(leaf)
         return leaf.reshape(leaf.shape + (1,) * missing) if missing else leaf
 
     return map_arrays(expand, node)
 
 
-def align_all(*nodes) -> list:
+def align_all(*nodes: Any) -> list:
     """Give the arrays of several records the number of batch axes that the largest of them has."""
     rank = max(map(batch_rank, nodes))
     return [align(node, rank) for node in nodes]
 
 
-def refuse_missing(record, where: str) -> None:
+def refuse_missing(record: Any, where: str) -> None:
     """Raise ValueError for a float leaf that is None, unless None is its default."""
     for field in dataclasses.fields(record):
         if "letters" in field.metadata and field.default is not None and getattr(record, field.name) is None:
             raise ValueError(f"{where}.{field.name} is None: expected numbers.")
 
 
-def undeclared_fields(record) -> list[str]:
+def undeclared_fields(record: Any) -> list[str]:
     """Names of the fields that are not said to be arrays or static, and hold no records."""
     plain = (f.name for f in dataclasses.fields(record) if not {"letters", "static", "stacked"} & set(f.metadata))
     return [name for name in plain if not _holds_records(getattr(record, name))]
 
 
-def _holds_records(value) -> bool:
+def _holds_records(value: Any) -> bool:
     return value is None or isinstance(value, tuple | dict) or dataclasses.is_dataclass(value)
 
 
-def array_fields(record) -> list[str]:
+def array_fields(record: Any) -> list[str]:
     """Names of the float leaves of a record."""
     return [field.name for field in dataclasses.fields(record) if "letters" in field.metadata]
 
 
-def letters_of(record, name: str) -> tuple:
+def letters_of(record: Any, name: str) -> tuple:
     """Letters of the axes of a float leaf, for one world. They may depend on the dimension, a static field."""
     letters = next(field.metadata["letters"] for field in dataclasses.fields(record) if field.name == name)
     return letters[0](record) if letters and callable(letters[0]) else letters

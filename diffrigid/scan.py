@@ -95,7 +95,7 @@ def _scan(
     return start, *_blocked_scan(recorded, start, (lengths, controls), steps, block)
 
 
-def fenced(world: World, saves: bool):
+def fenced(world: World, saves: bool) -> Callable[[State, Array, Any], State]:
     """`advance`, which reverse mode recomputes from the state; on a CPU behind a `lax.cond` that is always true.
 
     If it `saves` what the passes of a step find and hand on, each pass is recomputed from that.

@@ -4,7 +4,6 @@ x is the centre of mass, in the world frame; v and w are in the world frame. Not
 """
 
 from types import ModuleType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid import so2, so3
-from diffrigid.pytree import align, align_all, array, batch_rank, pytree, static
+from diffrigid.pytree import Vector, align, align_all, array, batch_rank, pytree, static
 
 COEFFICIENTS = (  # of colliders; all but the first two may be None
     "restitution",
@@ -145,7 +144,7 @@ def _refuse_times(state: State, dim: int, count: int, instead: str) -> None:
             )
 
 
-def material_point(state: State, body: int, point: Any) -> Array:
+def material_point(state: State, body: int, point: Vector) -> Array:
     """World position of a point fixed to a body, r = R r_b + x, (D, *batch) [m].
 
     Args:
@@ -164,7 +163,7 @@ def material_point(state: State, body: int, point: Any) -> Array:
     return state.x[body] + rotations(state.x.shape[1]).rotate(state.q[body], point)
 
 
-def material_velocity(state: State, body: int, point: Any) -> Array:
+def material_velocity(state: State, body: int, point: Vector) -> Array:
     """World velocity of a point fixed to a body, v + w x (R r_b), (D, *batch) [m/s].
 
     Args:
@@ -184,7 +183,7 @@ def material_velocity(state: State, body: int, point: Any) -> Array:
     return state.v[body] + so.cross(state.w[body], so.rotate(state.q[body], point))
 
 
-def _aligned(state: State, body: int, point: Any) -> tuple[State, Array]:
+def _aligned(state: State, body: int, point: Vector) -> tuple[State, Array]:
     """State and a point (D, *batch) with the same number of batch axes."""
     point, count, dim = jnp.asarray(point), len(state.x), 2 if state.q.shape[1] == 2 else 3
     _refuse_times(state, dim, count, "jax.vmap(lambda state: dr.material_point(state, 0, point))(trajectory.state)")

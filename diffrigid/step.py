@@ -3,6 +3,7 @@
 state -> forces -> flight -> contact [impact times -> impulses -> lever -> rest] -> state
 """
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from diffrigid.contact.crowd import without_room
 from diffrigid.controls import as_controls
 from diffrigid.convert import Numbers, at_least_one, largest, numbers
 from diffrigid.devices import on_cpu
-from diffrigid.pytree import batch_rank, map_arrays
+from diffrigid.pytree import Number, Vector, batch_rank, map_arrays
 from diffrigid.scan import MEMORY, advance, aligned, joined, scan_steps
 from diffrigid.shapes import traced
 from diffrigid.state import State
@@ -28,7 +29,7 @@ CALLS = 3000  # expected number of calls of `step`
 
 
 @uncollected
-def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
+def step(world: World, state: State, dt: Number, controls: Mapping[str, Any] | None = None) -> State:
     """State after dt [s]. A state that is off its joints is brought onto them first, as in `rollout`.
 
     Args:
@@ -54,8 +55,8 @@ def step(world: World, state: State, dt: Array, controls: Any = None) -> State:
 
 @uncollected
 def rollout(
-    world: World, state: State, *, dt: Any, steps: int | None = None, times: Any = None,
-    substeps: tuple[int, ...] | None = None, controls: Any = None, memory: int = MEMORY,
+    world: World, state: State, *, dt: Number, steps: int | None = None, times: Vector | None = None,
+    substeps: Sequence[int] | None = None, controls: Mapping[str, Any] | None = None, memory: int = MEMORY,
 ) -> Trajectory:  # fmt: skip
     """Trajectory from `state`, at every step or at given times.
 
@@ -105,7 +106,7 @@ def rollout(
     return Trajectory(t=t, state=states, world=world, controls=controls)
 
 
-def missed_pairs(world: World, state: State, dt: Any) -> Array:
+def missed_pairs(world: World, state: State, dt: Number) -> Array:
     """Number of neighbours, summed over the bodies, without room in a step of dt [s] from `state`, (...): should be 0.
 
     In a crowd, 256 discs or spheres and more without forces that meet only each other and half-spaces, pairs are
@@ -148,7 +149,7 @@ def floats(world: World, state: State) -> tuple[World, State]:
     return jax.tree.map(converted, (world, state))
 
 
-def step_length(dt: Any, state: State, batch: bool = False) -> Numbers:
+def step_length(dt: Number, state: State, batch: bool = False) -> Numbers:
     """dt as an array of the type of the state, checked where it is known; a number, or with `batch` also (*batch)."""
     length = numbers("dt", dt, None, finite=False).astype(state.x.dtype)
     allowed = state.x.shape[2:] if batch else ()

@@ -15,7 +15,7 @@ from diffrigid.sysid.covariance import Intervals, Linear, check_intervals, from_
 from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.intervals import describe
 from diffrigid.sysid.levenberg import INTERRUPTED, Point, Report, cost_of, levenberg
-from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.noise import all_noise, estimated_noise, rescaled
 from diffrigid.sysid.orders import impact_orders
 from diffrigid.sysid.parameters import pieces
@@ -43,12 +43,12 @@ def fit(
     observe: Mapping[str, Any] | None = None,
     widths: Sequence[float] | None = None,
     windows: Sequence[float] = (np.inf,),
-    loss: Any = SQUARES,
+    loss: Loss = SQUARES,
     solver: Callable | None = None,
     intervals: Intervals = from_jacobian,
     iterations: int | None = None,
     seed: int = 0,
-    resume: Any = None,
+    resume: Fit | Summary | None = None,
     progress: bool | None = None,
 ) -> Fit:
     """Fit parameters to records by least squares, from several starts in one batch.
@@ -150,7 +150,7 @@ def _check_parts(loss: Any, solver: Any, intervals: Any, seed: Any, resume: Any)
 
 
 def finish(
-    problem: Problem, point: Point, loss: Any, intervals: Intervals, seed: int, began: float, remarks: list[str]
+    problem: Problem, point: Point, loss: Loss, intervals: Intervals, seed: int, began: float, remarks: list[str]
 ) -> Fit:
     """Make the result at the best start, with noise estimated from the residuals."""
     if problem.noise:

@@ -25,6 +25,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid.convert import coefficient, known_number, numbers
+from diffrigid.pytree import Number, Vector
 
 NEAR_BOUND = 1e-3  # [-] of an interval: a start on a bound is pulled off it, a result this close is reported
 PULL = 1e-3  # a start on the bound of a positive parameter begins this far above it, in its unit
@@ -157,7 +158,7 @@ def each(kind: Any) -> Each:
     return Each(kind=kind)
 
 
-def prior(kind: Any, mean: Any, deviation: Any) -> Prior:
+def prior(kind: Any, mean: Number | Vector, deviation: Number | Vector) -> Prior:
     """A Gaussian prior beside the data: {"ball.mass": prior(positive(), 1.2, 0.1)}.
 
     Args:

@@ -18,6 +18,7 @@ from diffrigid.branches import choose
 from diffrigid.compiling import LASTING, compiled, uncollected
 from diffrigid.convert import at_least_one
 from diffrigid.sysid.levenberg import INTERRUPTED, UNFINISHED, Numbers, Point, point_at
+from diffrigid.sysid.losses import Loss
 from diffrigid.sysid.problem import Group, Plan, residuals_of
 
 ARMIJO = 1e-4  # [-] of the decrease predicted by the slope: what a step of L-BFGS has to achieve
@@ -87,7 +88,7 @@ def lbfgs(steps: int = 200, memory: int = 10) -> Callable:
     return solve
 
 
-def cost_and_slope(groups: Sequence[Group], z: Numbers, loss: Any) -> tuple[Array, Numbers]:
+def cost_and_slope(groups: Sequence[Group], z: Numbers, loss: Loss) -> tuple[Array, Numbers]:
     """Cost (S) and its gradient, by reverse mode."""
     total, shared, own = jnp.zeros_like(z.shared[0]), jnp.zeros_like(z.shared), jnp.zeros_like(z.own)
     for group in groups:
@@ -99,7 +100,7 @@ def cost_and_slope(groups: Sequence[Group], z: Numbers, loss: Any) -> tuple[Arra
 
 @uncollected
 @compiled(LASTING, "plan", "loss")
-def _group_slope(plan: Plan, loss: Any, z: Array, data: Any) -> tuple[Array, Array]:
+def _group_slope(plan: Plan, loss: Loss, z: Array, data: Any) -> tuple[Array, Array]:
     def cost(z):
         by_start = loss.rho(residuals_of(plan, z, data)).sum((0, 1))
         return by_start.sum(), by_start

@@ -24,7 +24,7 @@ from diffrigid.sysid.diagnosis import (
     weak,
 )
 from diffrigid.sysid.free import Free
-from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.noise import least_noise
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
 from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
@@ -38,7 +38,7 @@ CLOSE = 0.95  # [-] correlation from which on two parameters are reported to go 
 
 def describe(
     problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
-    residuals: tuple[dict[str, np.ndarray], ...], loss: Any,
+    residuals: tuple[dict[str, np.ndarray], ...], loss: Loss,
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """Parameters with intervals, and the notes under the table."""
     blind = blind_directions(linear, coordinates_of(problem))
@@ -70,7 +70,7 @@ def _parameters(
 
 def _notes(
     problem: Problem, linear: Linear, uncertainty: Uncertainty, blind: Sequence[Blind], ended: Sequence[str],
-    residuals: tuple[dict[str, np.ndarray], ...], loss: Any,
+    residuals: tuple[dict[str, np.ndarray], ...], loss: Loss,
 ) -> list[str]:  # fmt: skip
     """What the data cannot determine, and why not to believe the intervals."""
     notes, places = [b.words for b in blind], coordinates_of(problem)[: linear.shared]

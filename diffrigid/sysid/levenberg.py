@@ -19,6 +19,7 @@ from jax import Array
 from diffrigid.branches import choose
 from diffrigid.compiling import QUICK, compiled
 from diffrigid.linear import einsum
+from diffrigid.sysid.losses import Loss
 from diffrigid.sysid.problem import Group, linearise
 
 FAINT = 1e-2  # [-] of the largest slope: a number with a smaller slope is damped as if it had this one
@@ -94,18 +95,18 @@ def point_at(groups: Sequence[Group], z: Numbers) -> Point:
 
 
 @partial(jax.jit, static_argnames="loss")
-def cost_of(loss: Any, residuals: tuple[Array, ...]) -> Array:
+def cost_of(loss: Loss, residuals: tuple[Array, ...]) -> Array:
     """Sum of the loss over all residuals, (S); inf where one is not finite."""
     return jnp.concatenate([_costs(loss, r) for r in residuals]).sum(0)
 
 
-def _costs(loss: Any, residuals: Array) -> Array:
+def _costs(loss: Loss, residuals: Array) -> Array:
     """Cost of each record of a group, (R, S)."""
     total = loss.rho(residuals).sum(0)
     return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
 
-def arrow(loss: Any, point: Point, members: tuple[tuple[int, ...], ...]) -> Arrow:
+def arrow(loss: Loss, point: Point, members: tuple[tuple[int, ...], ...]) -> Arrow:
     """Normal equations at a point, with the residuals weighted by the loss."""
     a = point.z.shared.shape[0]
     rows, pulls = [], []
@@ -156,7 +157,7 @@ def damped(eq: Arrow, damping: Array, held: Array) -> Arrow:
 
 @compiled(QUICK, "loss", "members")
 def update(
-    loss: Any, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
+    loss: Loss, members: tuple[tuple[int, ...], ...], progress: Progress, trial: Point, reach: Numbers
 ) -> tuple[Progress, Numbers]:
     """Accept the trial where it costs less, otherwise keep the old point and raise the damping; also the next trial.
 
@@ -193,7 +194,7 @@ def _chosen(better: Array, whole: Array, new: Point, old: Point, members: tuple[
     return Point(z, tuple(r), tuple(jac))
 
 
-def best_by_record(groups: Sequence[Group], point: Point, loss: Any) -> np.ndarray:
+def best_by_record(groups: Sequence[Group], point: Point, loss: Loss) -> np.ndarray:
     """The start with the lowest cost for each record, (R,)."""
     members = tuple(group.members for group in groups)
     return np.asarray(_in_order(members, [_costs(loss, r) for r in point.residuals])).argmin(1)
@@ -210,7 +211,7 @@ def silent(count: int, costs: np.ndarray) -> None:
 
 
 def levenberg(
-    groups: Sequence[Group], z: Numbers, loss: Any, iterations: int | None, reach: Numbers, report: Report = silent
+    groups: Sequence[Group], z: Numbers, loss: Loss, iterations: int | None, reach: Numbers, report: Report = silent
 ) -> tuple[Point, str]:  # fmt: skip
     """Minimise from the starts z: the lowest points, and "", or why it ended before the best of them converged.
 
@@ -225,7 +226,7 @@ def levenberg(
 
 
 def minimise(
-    at: Callable[[Numbers], Point], members: tuple[tuple[int, ...], ...], z: Numbers, loss: Any,
+    at: Callable[[Numbers], Point], members: tuple[tuple[int, ...], ...], z: Numbers, loss: Loss,
     iterations: int | None, reach: Numbers, report: Report = silent,
 ) -> tuple[Point, str]:  # fmt: skip
     """`levenberg` for any residuals: `at` gives them and their Jacobians, for groups of the records `members`."""

@@ -5,13 +5,21 @@ squares with the weights of the last point (Holland and Welsch 1977).
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.convert import positive
 from diffrigid.sysid.free import as_given
+
+
+class Loss(Protocol):
+    """Verbs of a loss."""
+
+    def rho(self, r: Array) -> Array: ...
+
+    def weight(self, r: Array) -> Array: ...
 
 
 @dataclass(frozen=True)

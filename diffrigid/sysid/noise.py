@@ -1,13 +1,12 @@
 """Noise of the columns of a fit, from its residuals, and the fit in units of another noise."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from diffrigid.sysid.covariance import LEAST_FREE, Linear, eliminated, information, inverse
 from diffrigid.sysid.levenberg import Point, cost_of
-from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.points import by_column, linear_of, row_mask
 from diffrigid.sysid.records import series_of
 from diffrigid.sysid.setup import Problem
@@ -15,7 +14,7 @@ from diffrigid.sysid.setup import Problem
 LEAST_NOISE = 1e-12  # [-] of the largest value of its column: smaller noise is rounding, in double precision
 
 
-def estimated_noise(problem: Problem, point: Point, loss: Any) -> dict[str, float]:
+def estimated_noise(problem: Problem, point: Point, loss: Loss) -> dict[str, float]:
     """Standard deviation of the residuals of each column whose noise is not given, at the best start.
 
     Each column loses as many degrees of freedom as its residuals determine numbers (the trace of its part of the hat

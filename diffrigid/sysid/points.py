@@ -8,13 +8,13 @@ import numpy as np
 
 from diffrigid.sysid.covariance import Linear
 from diffrigid.sysid.levenberg import Point
-from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.problem import Group, of_record
 from diffrigid.sysid.records import series_of
 from diffrigid.sysid.setup import Problem
 
 
-def linear_of(problem: Problem, point: Point, best: int, loss: Any, estimated: bool) -> Linear:
+def linear_of(problem: Problem, point: Point, best: int, loss: Loss, estimated: bool) -> Linear:
     """Residuals and Jacobians of one start, record by record, without missing rows."""
     rows: list[Any] = [None] * len(problem.runs)
     for group, r, jac in zip(problem.groups, point.residuals, point.jacobians, strict=True):
@@ -27,7 +27,7 @@ def linear_of(problem: Problem, point: Point, best: int, loss: Any, estimated: b
     return Linear(residuals, jacobians, times, problem.sizes[0], variance, estimated)
 
 
-def _as_least_squares(loss: Any, residuals: tuple[np.ndarray, ...], numbers: int) -> tuple[Any, float]:
+def _as_least_squares(loss: Loss, residuals: tuple[np.ndarray, ...], numbers: int) -> tuple[Any, float]:
     """Pseudo-residuals with which least squares acts as the loss with these residuals, and their variance."""
     if isinstance(loss, Squares):
         return residuals, 1.0

@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid.convert import at_least_one
+from diffrigid.pytree import Vector
 from diffrigid.state import State
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, check_intervals
 from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.first_rows import is_begun
 from diffrigid.sysid.intervals import derived, describe
 from diffrigid.sysid.levenberg import best_by_record, levenberg
-from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.points import by_column
@@ -53,7 +54,7 @@ class Fit:
     uncertainty: Uncertainty  # of the shared numbers z
     residuals: tuple[dict[str, np.ndarray], ...]  # of each record by column, (K, size), in standard deviations
     starts: np.ndarray  # (a, starts) z of the shared numbers where every start ended, the best first, as `costs`
-    loss: Any
+    loss: Loss
     remarks: tuple[str, ...]  # those of `notes` that do not depend on the intervals
 
     @property
@@ -136,7 +137,7 @@ class Fit:
         """The fitted motion of the first record at its measured times."""
         return self.predict()
 
-    def predict(self, times: Any = None, record: int = 0, dt: float | None = None) -> Trajectory:
+    def predict(self, times: Vector | None = None, record: int = 0, dt: float | None = None) -> Trajectory:
         """Fitted motion of a record from its start on.
 
         Args:

@@ -23,6 +23,7 @@ from diffrigid.convert import at_least_one
 from diffrigid.sysid.covariance import inverse
 from diffrigid.sysid.intervals import coordinates_of, unit_of
 from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of
+from diffrigid.sysid.losses import Loss
 from diffrigid.sysid.parameters import Slot, reference, split
 from diffrigid.sysid.problem import Data, Plan, linearised
 from diffrigid.sysid.result import Fit, checked_fit
@@ -138,7 +139,7 @@ def _covariance(fit: Fit) -> np.ndarray:
 @compiled(LASTING, "nuts", "parts", "shared", "own", "loss", "counts")
 def _chains(
     nuts: Any, parts: tuple[tuple[Plan, tuple[int, ...]], ...], shared: tuple[Slot, ...], own: tuple[Slot, ...],
-    loss: Any, counts: tuple[int, int], keys: Array, first: Array, covariance: Array, data: tuple[Data, ...],
+    loss: Loss, counts: tuple[int, int], keys: Array, first: Array, covariance: Array, data: tuple[Data, ...],
     refer: list[Array], refer_own: list[Array],
 ) -> tuple[Array, Array]:  # fmt: skip
     """Draws of z, (chains, draws, n), and which of them diverged."""
@@ -177,7 +178,7 @@ def _log_volume(slots: Sequence[Slot], z: Array, refer: Sequence[Array]) -> Arra
     return sum((slot.kind.log_volume(piece, about) for slot, piece, about in pieces), jnp.zeros((), z.dtype))
 
 
-def _side_by_side(parts: Sequence[tuple[Plan, tuple[int, ...]]], loss: Any, a: int, b: int) -> Any:
+def _side_by_side(parts: Sequence[tuple[Plan, tuple[int, ...]]], loss: Loss, a: int, b: int) -> Any:
     """Make the cost of one z (n,), with its gradient by forward mode; `vmap` makes lanes on the last axis of it.
 
     Inside, the batch axis is last: steps with a leading batch axis are slower.
