@@ -382,7 +382,7 @@ def test_prediction_takes_the_steps_of_the_fit():
 
 
 def test_records_that_were_fitted_are_scored_from_what_was_found(fit, records, monkeypatch):
-    monkeypatch.setattr(sys.modules["diffrigid.sysid.result"], "SCORED", 0)
+    monkeypatch.setattr(sys.modules["diffrigid.sysid.result"], "SCORE_ITERATIONS", 0)
     backwards = records[::-1]
     residuals = np.concatenate([columns["p.x"].ravel() for columns in fit.residuals])
     expected = fit.noise["p.x"] * np.sqrt(np.nanmean(residuals**2))

@@ -15,7 +15,7 @@ from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.sensors import Channel, Part
 from diffrigid.world import World
 
-UNLIKE = 20.0  # [-] speeds that differ by more than this factor from those of the positions have another unit
+SPEED_RATIO = 20.0  # [-] speeds that differ by more than this factor from those of the positions have another unit
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def odd_speeds(found: Sequence[Series], channels: Mapping[str, Channel]) -> str:
             # Noise makes the positions of neighbours differ, but less so over a tenth of the record.
             near, far = (_median_size(_slopes(x, lag)) for lag in (1, max(len(x.t) // 10, 1)))
             speeds = _median_size(v.values)
-            if near > 0 and speeds > 0 and (speeds > UNLIKE * near or UNLIKE * speeds < min(near, far)):
+            if near > 0 and speeds > 0 and (speeds > SPEED_RATIO * near or SPEED_RATIO * speeds < min(near, far)):
                 return (
                     f"[{name!r}]: speeds of about {speeds:.3g}, but {parts[body, 'x']!r} moves at {far:.3g} a second: "
                     "are both in metres and seconds? If so, it is a motion faster than its rows show"

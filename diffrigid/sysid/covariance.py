@@ -11,10 +11,13 @@ import numpy as np
 from scipy.special import stdtrit
 
 BLOCKS = 20  # pieces of time that stand for independent runs where there is only one record
-LEFT = 0.01  # [-] of the information in a direction: if all clusters but one have less, they do not determine it
+LITTLE_INFORMATION = 0.01  # [-] of that in a direction: if all clusters but one have less, they do not determine it
 DRAWS = 2000  # of the bootstrap
 LEAST_FREE = 0.05  # [-] least share of degrees of freedom that is taken to be left
 NORMAL_FREEDOM = 1e6  # degrees of freedom for which Student's distribution is the normal one
+NO_INFORMATION = 1e-13  # [-] of the largest eigenvalue of a scaled information: smaller ones are rounding
+NO_EFFECT = 1e-10  # [-] likewise of the largest singular value of a scaled Jacobian
+TINY = 1e-300  # in place of a 0 in a denominator or a logarithm
 
 
 @dataclass(frozen=True)
@@ -129,22 +132,23 @@ def joint_covariance(linear: Linear, record: int, shared: np.ndarray) -> np.ndar
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
     """Inverse of a symmetric matrix >= 0, scaled first so that units do not matter; pseudo-inverse where singular."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    return np.linalg.pinv(matrix / scale / scale[:, None], rcond=1e-13, hermitian=True) / scale / scale[:, None]
+    scale = np.sqrt(np.maximum(np.diag(matrix), TINY))
+    scaled = matrix / scale / scale[:, None]
+    return np.linalg.pinv(scaled, rcond=NO_INFORMATION, hermitian=True) / scale / scale[:, None]
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:
     """R (a, rank) with R R^T the `inverse` of a matrix."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scale = np.sqrt(np.maximum(np.diag(matrix), TINY))
     sizes, vectors = np.linalg.eigh(matrix / scale / scale[:, None])
-    seen = sizes > 1e-13 * max(sizes[-1], 1e-300)
+    seen = sizes > NO_INFORMATION * max(sizes[-1], TINY)
     return vectors[:, seen] / np.sqrt(sizes[seen]) / scale[:, None]
 
 
 def _inverted(share: np.ndarray) -> np.ndarray:
     """Invert a share of the total information, scaled to 1 in every direction; 0 in directions with hardly any left."""
     sizes, vectors = np.linalg.eigh(share)
-    left = sizes > LEFT
+    left = sizes > LITTLE_INFORMATION
     return vectors[:, left] / sizes[left] @ vectors[:, left].T
 
 
@@ -153,7 +157,7 @@ def _told_by_one(H: list[np.ndarray], root: np.ndarray) -> np.ndarray:
     out = np.zeros((len(root), len(root)))
     for h in H:
         shares, vectors = np.linalg.eigh(root.T @ h @ root)
-        alone = root @ vectors[:, shares >= 1.0 - LEFT]
+        alone = root @ vectors[:, shares >= 1.0 - LITTLE_INFORMATION]
         out += alone @ alone.T
     return out
 
@@ -185,8 +189,8 @@ def eliminated(linear: Linear, record: int) -> tuple[np.ndarray, np.ndarray]:
     own = J[:, linear.shared :]
     if own.shape[1] == 0:
         return J, r
-    scale = np.sqrt(np.maximum((own**2).sum(0), 1e-300))
+    scale = np.sqrt(np.maximum((own**2).sum(0), TINY))
     basis, sizes, _ = np.linalg.svd(own / scale, full_matrices=False)
-    basis = basis[:, sizes > 1e-10 * max(sizes[0], 1e-300)]
+    basis = basis[:, sizes > NO_EFFECT * max(sizes[0], TINY)]
     shared = J[:, : linear.shared]
     return shared - basis @ (basis.T @ shared), r - basis @ (basis.T @ r)

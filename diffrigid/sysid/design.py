@@ -32,6 +32,7 @@ from diffrigid.world import World, check
 EXPECTED = ("parameter", "value", "expected 95 % interval", "unit")
 NUDGE = 1e-3  # change of z for differences
 UNDETERMINED = 1e6  # score where a number has no interval: finite, so that differences of scores are
+FIRST_STEP = 0.3  # of u, from every start
 SHRINK, GROW = 0.5, 1.5  # factor on the length of a step that loses, or gains
 
 
@@ -163,7 +164,7 @@ def best_launch(
 
 def _descended(scores: Callable, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
     """Descend from the starts u (S, n) along the gradient, each by steps of its own length: the best u, its score."""
-    length = np.full(len(u), 0.3)
+    length = np.full(len(u), FIRST_STEP)
     value, slope = scores(u)
     for _ in range(steps):
         size = np.sqrt((slope**2).sum(1, keepdims=True))

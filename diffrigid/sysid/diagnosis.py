@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffrigid.sysid.covariance import Linear, eliminated
+from diffrigid.sysid.covariance import TINY, Linear, eliminated
 from diffrigid.sysid.free import Free
 
 SAME_EFFECT = (
@@ -17,8 +17,9 @@ NEGLIGIBLE = 0.05  # [-] parts of a direction below this share of its largest ar
 LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that hardly determines it
 RARE = 1e-3  # chance below which residuals are not taken for noise
 LAGS = 5  # largest lag of the autocorrelation of residuals
+SAME_POWER = 0.02  # [-] changes or exponents that differ by less are taken as equal
 TOO_LARGE, TOO_SMALL = 1.2, 0.5  # [-] of the noise that was given: residuals beyond these are reported
-ANY = 20.0  # standard deviation of a logarithm beyond which the factor is not quoted
+ANY_FACTOR = 20.0  # standard deviation of a logarithm beyond which the factor is not quoted
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[
     """
     J = _first_record(linear, len(coordinates))
     sizes = np.sqrt((J**2).sum(0))
-    top = max(sizes.max(), 1e-300)
+    top = max(sizes.max(), TINY)
     unseen = sizes < ROUNDING * top
     out = []
     for path in dict.fromkeys(c.path for c in coordinates):
@@ -75,7 +76,7 @@ def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[
     seen = np.flatnonzero(~unseen)
     scaled = J[:, seen] / sizes[seen]
     values, vectors = np.linalg.eigh(scaled.T @ scaled) if len(seen) else (np.zeros(0), np.zeros((0, 0)))
-    for vector in reduced(vectors[:, values < SAME_EFFECT * values.max(initial=1e-300)].T):
+    for vector in reduced(vectors[:, values < SAME_EFFECT * values.max(initial=TINY)].T):
         direction = np.zeros(len(coordinates))
         kept = np.abs(vector) >= NEGLIGIBLE * np.abs(vector).max()
         direction[seen] = np.where(kept, vector, 0.0) / sizes[seen]
@@ -123,17 +124,18 @@ def _words(parts: Sequence[tuple[Coordinate, float]]) -> str:
     if len(parts) == 1:
         return f"nothing that was measured depends on {names[0]}"
     scales = steps[[c.name.endswith((".inertia[0]", ".inertia[1]", ".inertia[2]")) for c, _ in parts]]
-    if len(scales) == 3 and len({c.path for c, _ in parts}) == 1 and np.ptp(scales) < 0.02:  # see `charts.inertia`
+    # see `charts.inertia`
+    if len(scales) == 3 and len({c.path for c, _ in parts}) == 1 and np.ptp(scales) < SAME_POWER:
         return f"only the ratios of {parts[0][0].path} are seen: all times one factor is the same motion"
     if all(c.logarithmic for c, _ in parts):
         if len(parts) == 2:
             power = steps[0] / steps[1]  # a^p with b^1 move together: a / b^p is seen
-            if abs(power) < 0.98:
+            if abs(power) < 1.0 - SAME_POWER:
                 names, power = names[::-1], 1 / power
-            exponent = "" if abs(abs(power) - 1) < 0.02 else f"^{abs(power):.3g}"
+            exponent = "" if abs(abs(power) - 1) < SAME_POWER else f"^{abs(power):.3g}"
             what = "ratio" if power > 0 and not exponent else "product" if not exponent else "combination"
             return f"only the {what} {names[0]} {'/' if power > 0 else '*'} {names[1]}{exponent} is seen"
-        if np.all(np.abs(steps - 1) < 0.02):
+        if np.all(np.abs(steps - 1) < SAME_POWER):
             return f"only the ratios of {', '.join(names)} are seen: all times one factor is the same motion"
     changes = ", ".join(
         f"{c.name} {s:+.2g}{' (relative)' if c.logarithmic else ''}" for (c, _), s in zip(parts, steps, strict=True)
@@ -147,7 +149,7 @@ def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate], ended: Colle
     for c, s in zip(coordinates, np.sqrt(np.diag(covariance)), strict=True):
         if not LARGE * c.scale < s < np.inf or c.path in ended:
             continue
-        factor = f"a factor {np.exp(s):.2g}" if s < ANY else "any factor"
+        factor = f"a factor {np.exp(s):.2g}" if s < ANY_FACTOR else "any factor"
         known = f"known to {factor if c.logarithmic else f'+- {s:.2g}'}"
         words = "its interval is as wide as its bounds let it be" if c.bounded else known
         notes.append(f"{c.name} is hardly seen: {words}")

@@ -28,7 +28,7 @@ from diffrigid.world import World
 
 SQUARES = Squares()
 NOT_SMALL = 0.1  # [-] of the spread of a column: larger residuals that are not noise are named before a blind parameter
-AGREES = 0.5, 1e-3  # absolute, and relative to the best loss: a start that ends within their sum agrees with the best
+AGREES, AGREES_RELATIVE = 0.5, 1e-3  # of the loss, and of the best: a start within their sum agrees with the best
 
 
 def fit(
@@ -172,7 +172,7 @@ def finish(
         remarks = [*jump, *(remark for remark in remarks if remark == INTERRUPTED)]
     remarks = [*remarks, *remarks_on(problem, scenes, in_units), *stuck]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
-    order, alike = np.argsort(costs), costs <= costs[best] + AGREES[0] + AGREES[1] * costs[best]
+    order, alike = np.argsort(costs), costs <= costs[best] + AGREES + AGREES_RELATIVE * costs[best]
     summary = Summary(
         parameters=parameters, noise=all_noise(problem), costs=costs[order],
         orders=impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum())),

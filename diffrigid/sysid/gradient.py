@@ -23,7 +23,7 @@ from diffrigid.sysid.problem import Group, Plan, residuals_of
 
 ARMIJO = 1e-4  # [-] of the decrease predicted by the slope: what a step of L-BFGS has to achieve
 HALVINGS = 20
-STILL = 1e-10  # [-] relative decrease of the cost at which it ends
+LBFGS_SETTLED = 1e-10  # [-] relative decrease of the cost at which it ends
 
 
 def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Callable:
@@ -77,7 +77,7 @@ def lbfgs(steps: int = 200, memory: int = 10) -> Callable:
                 gradient = _flat(_held(slope, reach))
                 change, state = _direction(scale, gradient, state, flat)
                 flat, new, slope = _line_search(groups, z, loss, flat, -change, cost, gradient)
-                ended = cost - new <= STILL * jnp.abs(cost)
+                ended = cost - new <= LBFGS_SETTLED * jnp.abs(cost)
                 cost = new
                 if bool(ended.all()):
                     break

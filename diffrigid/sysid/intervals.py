@@ -11,7 +11,7 @@ from jax import Array
 from diffrigid.compiling import QUICK, compiled, uncollected
 from diffrigid.paths import component, unit, write
 from diffrigid.state import State
-from diffrigid.sysid.covariance import LEAST_FREE, Linear, Uncertainty, joint_covariance, own_covariance
+from diffrigid.sysid.covariance import LEAST_FREE, TINY, Linear, Uncertainty, joint_covariance, own_covariance
 from diffrigid.sysid.diagnosis import (
     Blind,
     Coordinate,
@@ -122,7 +122,7 @@ def _note(slot: Slot, value: np.ndarray, blind: Sequence[Blind]) -> str:
 def unseen_of(blind: Sequence[Blind], rows: slice) -> np.ndarray:
     """Orthonormal basis (n, k), n directions, of the undetermined changes of k numbers of z."""
     parts = np.stack([np.zeros(rows.stop - rows.start), *(b.direction[rows] for b in blind)])
-    parts = parts / np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), 1e-300)
+    parts = parts / np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), TINY)
     _, sizes, basis = np.linalg.svd(parts, full_matrices=False)
     return basis[sizes > UNSEEN]
 

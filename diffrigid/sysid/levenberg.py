@@ -23,10 +23,13 @@ from diffrigid.sysid.losses import Loss
 from diffrigid.sysid.problem import Group, linearise
 
 FAINT = 1e-2  # [-] of the largest slope: a number with a smaller slope is damped as if it had this one
-DAMPING = (1e-9, 1e9)  # least and most; the least holds slopes below 3e-7 of the largest: rounding, or yielding joints
+LEAST_DAMPING = 1e-9  # holds slopes below 3e-7 of the largest: rounding, or yielding joints
+MOST_DAMPING = 1e9
+LESS_DAMPING, MORE_DAMPING = 0.2, 4.0  # factors after a step that was accepted, and one that was not
 STIFF = 1e7  # a damping above which a start counts as converged
 NO_GAIN = 1e-9  # predicted decrease, relative to the mean cost of a residual, below which a start has converged
-SETTLED = 1e-8  # decrease of the cost, relative to it, below which an accepted step was the last
+COST_SETTLED = 1e-8  # decrease of the cost, relative to it, below which an accepted step was the last
+GAIN_SETTLED = 1e-6  # decrease predicted for the next step, relative to the cost, above which it was not
 ITERATIONS = 60  # at most, unless another number is asked for
 INTERRUPTED = "interrupted: the best so far"
 UNFINISHED = "not converged after {} iterations: raise iterations, or start elsewhere"
@@ -171,14 +174,14 @@ def update(
     point = _chosen(better, whole, trial, progress.point, members)
     cost = jnp.where(better, new_cost, progress.cost)
     before, after = (jnp.where(alone, c, c.sum(0)[None]) for c in (progress.cost, cost))
-    settled = better & (before - after <= SETTLED * after)
-    damping = jnp.clip(progress.damping * jnp.where(better, 0.2, 4.0), *DAMPING)
+    settled = better & (before - after <= COST_SETTLED * after)
+    damping = jnp.clip(progress.damping * jnp.where(better, LESS_DAMPING, MORE_DAMPING), LEAST_DAMPING, MOST_DAMPING)
     eq = damped(arrow(loss, point, members), damping.T, held)
     shared, own = solve(eq)
     gain = -0.5 * (eq.h * own).sum(-1).T
     gain = jnp.where(alone, gain, (gain.sum(0) - 0.5 * (eq.g * shared).sum(-1))[None])
     level = after / sum(len(r) for r in point.residuals)
-    settled = settled & (gain <= 100.0 * SETTLED * after)
+    settled = settled & (gain <= GAIN_SETTLED * after)
     done = (gain < NO_GAIN * level) | settled | (damping > STIFF) | ~jnp.isfinite(level)
     step = Numbers(shared.T, jnp.transpose(own, (2, 1, 0)))
     step = jax.tree.map(lambda dz, most: jnp.clip(jnp.where(jnp.isfinite(dz), dz, 0.0), -most, most), step, reach)

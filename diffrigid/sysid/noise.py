@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from diffrigid.sysid.covariance import LEAST_FREE, Linear, eliminated, information, inverse
+from diffrigid.sysid.covariance import LEAST_FREE, TINY, Linear, eliminated, information, inverse
 from diffrigid.sysid.levenberg import Point, cost_of
 from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.points import by_column, linear_of, row_mask
@@ -12,6 +12,7 @@ from diffrigid.sysid.records import series_of
 from diffrigid.sysid.setup import Problem
 
 LEAST_NOISE = 1e-12  # [-] of the largest value of its column: smaller noise is rounding, in double precision
+FROM_MEDIAN = 1.4826  # standard deviation of normal noise over the median of its absolute values
 
 
 def estimated_noise(problem: Problem, point: Point, loss: Loss) -> dict[str, float]:
@@ -27,7 +28,7 @@ def estimated_noise(problem: Problem, point: Point, loss: Loss) -> dict[str, flo
         free = [r[name] for run, r in zip(problem.runs, residuals, strict=True) if name in r and name not in run.noise]
         values = np.concatenate([piece[np.isfinite(piece)] for piece in free])
         share = max(1.0 - lost[name] / max(len(values), 1), LEAST_FREE)
-        size = np.mean(values**2) if isinstance(loss, Squares) else (1.4826 * np.median(np.abs(values))) ** 2
+        size = np.mean(values**2) if isinstance(loss, Squares) else (FROM_MEDIAN * np.median(np.abs(values))) ** 2
         found[name] = max(float(sigma * np.sqrt(size / share)), least_noise(problem, name)) if len(values) else sigma
     return found
 
@@ -59,7 +60,7 @@ def _leverages(linear: Linear, record: int, shared: np.ndarray) -> np.ndarray:
     own = linear.slopes[record][:, linear.shared :]
     hat = np.einsum("mi,ij,mj->m", J, shared, J)
     if own.shape[1]:
-        basis = np.linalg.svd(own / np.maximum(np.abs(own).max(0), 1e-300), full_matrices=False)[0]
+        basis = np.linalg.svd(own / np.maximum(np.abs(own).max(0), TINY), full_matrices=False)[0]
         hat = hat + (basis**2).sum(1)
     return hat
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from diffrigid.impacts import order_of_impacts
 from diffrigid.sysid.levenberg import Numbers
-from diffrigid.sysid.problem import LOOKED_AT, linearise, of_record
+from diffrigid.sysid.problem import SHOWN_RECORDS, SHOWN_STARTS, linearise, of_record
 from diffrigid.sysid.records import SAME_TIME
 from diffrigid.sysid.setup import Problem, fitted_scene
 from diffrigid.sysid.times import controls_over
 from diffrigid.trajectory import Trajectory
 
-NAMED, LISTED = 3, 8  # orders that are written out, and pairs of each
+WRITTEN_ORDERS, WRITTEN_PAIRS = 3, 8  # orders that are written out, and pairs of each
 
 Orders = tuple[tuple[tuple[str, ...], ...], ...]
 
@@ -27,7 +27,7 @@ def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
 
     Motions have the steps of the fit, so that what is compiled already gives them.
     """
-    records, starts = min(LOOKED_AT[0], len(problem.runs)), min(LOOKED_AT[1], count)
+    records, starts = min(SHOWN_RECORDS, len(problem.runs)), min(SHOWN_STARTS, count)
     shared, own = np.asarray(z.shared, float), np.asarray(z.own, float)
     found: dict[tuple[int, int], tuple[str, ...]] = {}
     for group in problem.groups:
@@ -75,9 +75,9 @@ def in_words(orders: Orders, starts: int) -> str:
     whole = f"{starts} starts" if len(orders) == starts else f"the best {len(orders)} of {starts} starts"
     parts = [
         f"{len(members)} of {len(orders) if n else whole}: {_listed(order[record])}"
-        for n, (members, order) in enumerate(zip(groups[:NAMED], kinds, strict=False))
+        for n, (members, order) in enumerate(zip(groups[:WRITTEN_ORDERS], kinds, strict=False))
     ]
-    others = sum(map(len, groups[NAMED:]))
+    others = sum(map(len, groups[WRITTEN_ORDERS:]))
     return f"impacts{where}, " + "; ".join([*parts, *([f"{others} in other orders"] if others else [])])
 
 
@@ -90,5 +90,5 @@ def _listed(order: Sequence[str]) -> str:
         else:
             runs.append([pair, 1])
     texts = [pair if count == 1 else f"{pair} x {count}" for pair, count in runs]
-    more = [f"and {len(texts) - LISTED} more"] if len(texts) > LISTED else []
-    return ", ".join([*texts[:LISTED], *more]) or "none"
+    more = [f"and {len(texts) - WRITTEN_PAIRS} more"] if len(texts) > WRITTEN_PAIRS else []
+    return ", ".join([*texts[:WRITTEN_PAIRS], *more]) or "none"

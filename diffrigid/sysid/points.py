@@ -13,6 +13,8 @@ from diffrigid.sysid.problem import Group, of_record
 from diffrigid.sysid.records import series_of
 from diffrigid.sysid.setup import Problem
 
+LEAST_BEND = 0.05  # [-] least mean curvature of a loss, of squares 1: residuals are not blown up further
+
 
 def linear_of(problem: Problem, point: Point, best: int, loss: Loss, estimated: bool) -> Linear:
     """Residuals and Jacobians of one start, record by record, without missing rows."""
@@ -34,7 +36,7 @@ def _as_least_squares(loss: Loss, residuals: tuple[np.ndarray, ...], numbers: in
     joined = jnp.asarray(np.concatenate(residuals))
     slope = jax.grad(lambda r: loss.rho(r).sum())
     bend = float(jax.jvp(slope, (joined,), (jnp.ones_like(joined),))[1].mean())
-    parts = tuple(np.asarray(slope(jnp.asarray(r)), float) / max(bend, 0.05) for r in residuals)
+    parts = tuple(np.asarray(slope(jnp.asarray(r)), float) / max(bend, LEAST_BEND) for r in residuals)
     variance = float(sum((part**2).sum() for part in parts) / max(len(joined) - numbers, 1))
     return parts, variance
 

@@ -28,8 +28,8 @@ from diffrigid.sysid.records import Run, series_of
 from diffrigid.sysid.sensors import difference, is_angle, is_turn
 from diffrigid.sysid.times import controls_over, grid
 
-LOOKED_AT = (3, 64)  # records and starts, at most, whose motions are returned
-LITTLE = 10_000_000  # work in all records, starts and directions, up to which a fit compiles for longer than it runs
+SHOWN_RECORDS, SHOWN_STARTS = 3, 64  # at most, whose motions are returned
+LITTLE_WORK = 10_000_000  # in all records, starts and directions: up to it a fit compiles for longer than it runs
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ def linearised(plan: Plan, z: Array, data: Data) -> tuple[Array, Array, State]:
     unit = jnp.broadcast_to(jnp.eye(n, dtype=z.dtype)[:, :, None, None], (n, n, R, S)).reshape(n, -1)
     spread_out = _spread(data, n, S)
     value, slope, states = jax.jvp(lambda z: _simulated(plan, z, spread_out), (wide,), (unit,), has_aux=True)
-    few = (..., 0, *map(slice, LOOKED_AT))
+    few = (..., 0, *map(slice, (SHOWN_RECORDS, SHOWN_STARTS)))
     some = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], n, R, S)[few], states)
     return value.reshape(-1, n, R, S)[:, 0], slope.reshape(-1, n, R, S), everywhere(some)
 
@@ -263,7 +263,7 @@ def evaluate(plan: Plan, z: Array, data: Data) -> Array:
 
 def _is_much(z: Array, data: Data) -> bool:
     """Whether the simulation in the directions of all z takes longer than its compilation, or is for a GPU."""
-    return not on_cpu() or z.size * len(data.lengths) * work(data.scene.world) > LITTLE
+    return not on_cpu() or z.size * len(data.lengths) * work(data.scene.world) > LITTLE_WORK
 
 
 def _spread(data: Data, copies: int, starts: int) -> Data:

@@ -14,10 +14,12 @@ from diffrigid.sysid.result import Fit, checked_fit
 from diffrigid.sysid.setup import reach_of
 from diffrigid.sysid.summary import Parameter
 
-WIDE = 1.6  # [-] of the half width of the interval from the Jacobian: extent of the profile on either side
+EXTENT = 1.6  # [-] of the half width of the interval from the Jacobian: extent of the profile on either side
+NOT_DETERMINED = 10.0  # standard deviation of z from which on that extent is not used
+FAR = 5.0  # extent in z instead: a factor e^5
 FURTHER = 3  # how often that is then doubled, where the cost has not risen to the level
 REFINED = 2  # how often the level is bracketed again after such steps
-HELD = 30  # iterations for the other numbers
+PROFILE_ITERATIONS = 30  # iterations for the other numbers
 AT_BOUND = 15.0  # z at which a bounded number is at its bound to single precision
 
 
@@ -77,7 +79,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
     kind, index = _kind_and_index(fit, name)
     quantile = fit.uncertainty.quantile
     deviation = float(np.sqrt(fit.covariance[index, index]))
-    half = WIDE * quantile * deviation if np.isfinite(deviation) and deviation < 10 else 5.0
+    half = EXTENT * quantile * deviation if deviation < NOT_DETERMINED else FAR
     level, most = 0.5 * quantile**2, np.inf if np.isinf(kind.low) else AT_BOUND
     z = fit.shared[index] + np.linspace(-half, half, points)
     z, rise = _extended(fit, index, z, level, points // 2, most)
@@ -154,7 +156,7 @@ def _rises(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
         shared[index] = held
         own = np.repeat(fit.own[..., None], count, axis=-1)
         start = Numbers(*(jnp.asarray(part, fit.problem.dtype) for part in (shared, own)))
-        point, _ = levenberg(fit.problem.groups, start, fit.loss, HELD, reach)
+        point, _ = levenberg(fit.problem.groups, start, fit.loss, PROFILE_ITERATIONS, reach)
         out.append(np.asarray(cost_of(fit.loss, point.residuals), float))
     return np.maximum(np.concatenate(out)[: len(z)] - fit.costs[0], 0.0)
 

@@ -17,6 +17,7 @@ from diffrigid.tables import moment
 from diffrigid.world import World, check
 
 SAME_TIME = 1e-9  # [s] times of different columns that are this close are the same
+MEDIAN = 0.6745  # of the absolute values of normal noise, over its standard deviation
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,8 @@ def _refuse_empty_columns(found: list[Run]) -> None:
 def noise_guess(values: np.ndarray, turn: float) -> float:
     """Standard deviation of the noise of a column (K, size) from second differences, which smooth motion hardly has.
 
+    Those of independent noise have six times its variance.
+
     Args:
         turn: period after which values are the same again; 0: none.
     """
@@ -157,4 +160,4 @@ def noise_guess(values: np.ndarray, turn: float) -> float:
     if second.size == 0:
         return 1.0
     floor = 1e-6 * float(np.nanmax(np.abs(values))) or 1e-9
-    return max(float(np.median(second)) / (0.6745 * np.sqrt(6.0)), floor)
+    return max(float(np.median(second)) / (MEDIAN * np.sqrt(6.0)), floor)

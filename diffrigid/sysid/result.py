@@ -30,7 +30,7 @@ from diffrigid.sysid.times import all_times, motion
 from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
 
-SCORED = 30  # iterations for the own numbers of a record that was held out
+SCORE_ITERATIONS = 30  # iterations for the own numbers of a record that was held out
 POOR = 3.0  # [-] times the noise of the fit: scores beyond which a start that was not the record's own is doubted
 
 
@@ -182,7 +182,7 @@ class Fit:
         problem = with_noise(problem, {name: self.noise.get(name, s) for name, s in problem.noise.items()})
         z, reach = make_starts(problem, starts, seed), reach_of(problem, range(problem.sizes[0]))
         z = z._replace(shared=jnp.repeat(z.shared[:, :1], starts, axis=1))
-        iterations = SCORED if problem.own else 0
+        iterations = SCORE_ITERATIONS if problem.own else 0
         point, _ = levenberg(problem.groups, z, self.loss, iterations, reach)
         best = best_by_record(problem.groups, point, self.loss)
         found = [by_column(problem, point, start, in_units=True)[k] for k, start in enumerate(best)]

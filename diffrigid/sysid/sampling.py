@@ -20,7 +20,7 @@ from jax import Array
 
 from diffrigid.compiling import LASTING, compiled, uncollected
 from diffrigid.convert import at_least_one
-from diffrigid.sysid.covariance import inverse
+from diffrigid.sysid.covariance import TINY, inverse
 from diffrigid.sysid.intervals import coordinates_of, unit_of
 from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of
 from diffrigid.sysid.losses import Loss
@@ -33,8 +33,8 @@ from diffrigid.sysid.table import rows_of
 from diffrigid.tables import lined_up
 
 ACCEPTED = 0.8  # [-] share of accepted proposals to which the length of the steps is tuned
-SETTLED = 1.01  # R-hat above which chains do not agree
-UNLIKE = 1.25  # ratio of widths from which an interval differs from that of the fit
+R_HAT_AGREES = 1.01  # R-hat above which chains do not agree
+WIDTH_RATIO = 1.25  # ratio of widths from which an interval differs from that of the fit
 HEADER = ("parameter", "mean", "95 % interval", "of the fit", "unit", "R-hat", "draws worth")
 
 
@@ -228,7 +228,7 @@ def _posterior(fit: Fit, values: dict[str, np.ndarray], divergent: int) -> Poste
         parameters.append(Parameter(name, value.mean((0, 1)), low, high, unit_of(problem, slots[name]), "", records))
         r_hat[name], size[name] = _quality(value)
     notes = [f"{divergent} steps diverged: the density is too steep somewhere"] if divergent else []
-    notes += [f"chains do not agree on {n} (R-hat {r:.3g}): draw more" for n, r in r_hat.items() if r > SETTLED]
+    notes += [f"chains do not agree on {n} (R-hat {r:.3g}): draw more" for n, r in r_hat.items() if r > R_HAT_AGREES]
     notes += [note for p in parameters if (note := _compared(p, fit[p.name]))]
     return Posterior(values, tuple(parameters), r_hat, size, fit, tuple(notes))
 
@@ -274,8 +274,8 @@ def agreement(draws: np.ndarray) -> tuple[float, float]:
 
 def _compared(drawn: Parameter, fitted: Parameter) -> str:
     """Note if the interval of the fit is too narrow or too wide, else ""."""
-    ratio = (drawn.high - drawn.low) / np.maximum(fitted.high - fitted.low, 1e-300)
-    worst = float(ratio.flat[np.abs(np.log(np.maximum(ratio, 1e-300))).argmax()])
-    if 1 / UNLIKE < worst < UNLIKE:
+    ratio = (drawn.high - drawn.low) / np.maximum(fitted.high - fitted.low, TINY)
+    worst = float(ratio.flat[np.abs(np.log(np.maximum(ratio, TINY))).argmax()])
+    if 1 / WIDTH_RATIO < worst < WIDTH_RATIO:
         return ""
     return f"the interval of {drawn.name} is {worst:.2g} times as wide as that of the fit"

@@ -26,6 +26,7 @@ from diffrigid.convert import at_least_one
 from diffrigid.state import State, rotations
 from diffrigid.sysid.charts import rotation
 from diffrigid.sysid.columns import columns
+from diffrigid.sysid.covariance import TINY
 from diffrigid.sysid.first_rows import shown, with_values
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import Each, each, real
@@ -184,4 +185,4 @@ def _lost(first: Fit, whole: Fit) -> list[str]:
 def _rms(fit: Fit, name: str) -> float:
     """Root mean square of the residuals of a column, in its unit."""
     values = [fit.noise[name] * record[name].ravel() for record in fit.residuals if name in record]
-    return max(float(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), 1e-300)
+    return max(float(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), TINY)

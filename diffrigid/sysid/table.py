@@ -15,7 +15,7 @@ HEADER = ("parameter", "value", "95 % interval", "unit", "")
 BLIND = "not determined, see below"  # note of a parameter with a number that has no interval
 BOUND = "at its bound"  # note of a parameter that ended there
 DOUBTS = ("the fit failed", "not converged", "the cost jumps")  # beginnings of notes that concern every number
-SHOWN = 3  # records whose own numbers are in the table
+TABLE_RECORDS = 3  # records whose own numbers are in the table
 
 
 def rows(summary: "Summary") -> list[tuple[str, ...]]:
@@ -26,7 +26,7 @@ def rows(summary: "Summary") -> list[tuple[str, ...]]:
 def rows_of(p: Any) -> list[tuple[str, ...]]:
     """Rows of one parameter; if each record has its own, those of the first three, {0}, {1}, ..., or of all four."""
     out: list[tuple[str, ...]] = []
-    shown = p.records if p.records <= SHOWN + 1 else SHOWN  # a line that hides one record saves none
+    shown = p.records if p.records <= TABLE_RECORDS + 1 else TABLE_RECORDS  # a line that hides one record saves none
     for index in np.ndindex(p.value.shape):
         if p.records and index[0] >= shown:
             continue

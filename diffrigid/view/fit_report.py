@@ -8,11 +8,12 @@ import numpy as np
 
 from diffrigid.impacts import contacts
 from diffrigid.sysid.columns import Series
+from diffrigid.sysid.covariance import TINY
 from diffrigid.sysid.intervals import number_names
 from diffrigid.sysid.orders import alike
 from diffrigid.sysid.profile import ProfileLikelihood, profile, with_profiles
 from diffrigid.sysid.sensors import Part
-from diffrigid.sysid.table import HEADER, SHOWN, below, rows
+from diffrigid.sysid.table import HEADER, TABLE_RECORDS, below, rows
 from diffrigid.trajectory import Trajectory
 from diffrigid.view.play import Player, play
 from diffrigid.view.report import Curve, Section, chart, matrix, write_report
@@ -30,7 +31,7 @@ def report(fit: "Fit", path: str | Path, title: str, profiles: Sequence[str]) ->
     """Write the page. The motion and the residuals are those of the first three records."""
     found = [profile(fit, name) for name in profiles]
     fit = with_profiles(fit, found)
-    motions = [fit.predict(record=k) for k in range(min(len(fit.scenes), SHOWN))]
+    motions = [fit.predict(record=k) for k in range(min(len(fit.scenes), TABLE_RECORDS))]
     sections = [_numbers(fit), _unknown(fit), _motion(fit, motions), _residuals(fit, motions)]
     sections += [section for section in (_search(fit, found),) if section.charts]
     return write_report(path, title, " ".join(LEAD.split()), [*sections, _origin(fit)])
@@ -139,7 +140,7 @@ def _search(fit: "Fit", found: Sequence[ProfileLikelihood]) -> Section:
 
 def cost_chart(fit: "Fit") -> str:
     """Chart of the cost at which every start ended, lowest first, coloured by the order of impacts, grey if unknown."""
-    over = np.round(np.log10(fit.costs / max(fit.costs[0], 1e-300)), 3)
+    over = np.round(np.log10(fit.costs / max(fit.costs[0], TINY)), 3)
     groups = [np.array(members) for members in alike(fit.orders)]
     groups = [*groups[:2], np.concatenate(groups[2:])] if len(groups) > 2 else groups
     rest = np.arange(len(fit.orders), np.isfinite(fit.costs).sum())

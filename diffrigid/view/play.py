@@ -21,7 +21,7 @@ from diffrigid.trajectory import Trajectory, checked
 from diffrigid.view.frames import record
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"  # nothing is ever loaded
-SHOWN = ("trails", "velocities", "contacts", "data")  # what can be shown or hidden
+LAYERS = ("trails", "velocities", "contacts", "data")  # what can be shown or hidden
 THEMES = ("auto", "light", "dark")
 PLOTS = {
     2: ("energy", "speed", "x", "y", "angle", "vx", "vy", ""),
@@ -122,8 +122,8 @@ def _check(runs: Mapping[str, Trajectory], show: frozenset[str], theme: str, spe
     dims = {name: run.world.dim for name, run in runs.items()}
     if len(set(dims.values())) != 1:
         raise ValueError(f"play: expected trajectories of one dimension, at least one, got {dims}")
-    if unknown := show - set(SHOWN):
-        raise ValueError(f"show has {sorted(unknown)}: expected some of {SHOWN}")
+    if unknown := show - set(LAYERS):
+        raise ValueError(f"show has {sorted(unknown)}: expected some of {LAYERS}")
     if theme not in THEMES:
         raise ValueError(f"theme is {theme!r}: expected one of {THEMES}")
     if not speed > 0 or frames < 2:
