@@ -230,7 +230,11 @@ class Fit:
         )
 
     def with_intervals(self, intervals: Intervals) -> "Fit":
-        """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap."""
+        """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap.
+
+        Raises:
+            ValueError: intervals is not a function.
+        """
         check_intervals(intervals)
         uncertainty = intervals(self.linear)
         parameters, notes = describe(
@@ -257,6 +261,9 @@ class Fit:
 
         Args:
             profiles: shared numbers whose profile likelihood is drawn, each some more fits.
+
+        Raises:
+            ValueError: no such shared number to profile.
         """
         from diffrigid.view import fit_report  # points down, so that a result draws itself
 

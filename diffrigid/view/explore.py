@@ -52,7 +52,11 @@ class Explorer:
         self.move(next(iter(self.ranges)), None)
 
     def move(self, name: str, value: float | None) -> None:
-        """Set a parameter (None: leave its value), and show the linear prediction along it from now on."""
+        """Set a parameter (None: leave its value), and show the linear prediction along it from now on.
+
+        Raises:
+            ValueError: there is no slider of this name.
+        """
         if name not in self.ranges:
             raise ValueError(f"no slider {name!r}, there are {list(self.ranges)}")
         self.leading, (low, high) = name, self.ranges[name]
