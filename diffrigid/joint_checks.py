@@ -129,7 +129,7 @@ def _from_start(so: Any, fields: list[str], given: dict[str, Any], a: Pose, b: P
         "zero": lambda a, b, given: so.difference(b.q, a.q),
         "length": lambda a, b, given: norm(separation(Distance(a=None, **given), so, a, b)),
     }
-    if so.D == 2 and not {"lower", "upper"} & set(given):  # else the angle of a is counted from that of b
+    if so.D == 2 and not {"lower", "upper"} & set(given):  # otherwise the angle of a is counted from that of b
         at_start.pop("zero")
     return {field: known(at_start[field], a, b, given) for field in fields if field in at_start and field not in given}
 

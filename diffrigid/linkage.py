@@ -159,7 +159,7 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench, span: Array) -> Wrench:
     """Forces of a world, with the constraint forces of its joints, for an integration over span (*batch) [s]."""
-    state = unfused(opaque_true(state.x), lambda state: state, state)  # else recomputed for every use of it
+    state = unfused(opaque_true(state.x), lambda state: state, state)  # otherwise recomputed for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
     given = _damped(joints, link, twists_of(state), jnp.concatenate([wrench.F, torque], axis=1), span)
@@ -251,7 +251,7 @@ def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> St
 
     Both use J at the poses before, so the velocities then satisfy the joints up to the effect of the displacement.
     """
-    state = unfused(opaque_true(state.x), lambda state: state, state)  # else computed again for every use of it
+    state = unfused(opaque_true(state.x), lambda state: state, state)  # otherwise computed again for every use of it
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     off = jnp.stack([joint_errors(so, link.groups), _rates(link, twists_of(state))])
     moved, kicked = jax.vmap(lambda off: _moved(link, _pull(link, _multipliers(link, off))))(off)

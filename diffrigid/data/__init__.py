@@ -35,7 +35,7 @@ def square_drops() -> SquareDrops:
         one corner strikes, the nearest face being turned by more than 15 degrees, and strikes alone: at least
         22 frames of free flight follow;
         no frame is lost at the impact: the arcs of the 7 frames before and the 12 frames after it meet, in x, z
-        and angle at one time, to 0.35 mm and 0.35 degrees. Of 134 recordings where it can be told, 78 only do so
+        and angle at one time, to 0.35 mm and 0.35 degrees. Among 134 recordings where it can be seen, 78 only do so
         when one arc is shifted by a frame: tracking lost one, and no model of an impact fits those 4 ms.
     Each begins three frames before the first contact and ends twenty frames after the impact.
     """

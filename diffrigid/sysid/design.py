@@ -191,7 +191,7 @@ def _problem(scenes: Sequence[tuple[World, State]], planned, free, noise, observ
         if whole not in (noise or {}):
             raise ValueError(f"noise: expected a standard deviation for every planned column, {whole!r} has none")
         values = _zeros(world, name, planned[name], len(t), observe)
-        if np.isfinite(values).any():  # else nothing will be measured
+        if np.isfinite(values).any():  # otherwise nothing will be measured
             columns[name] = values
             kept.add(whole)
     gone = set(wholes.values()) - kept

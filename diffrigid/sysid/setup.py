@@ -113,7 +113,7 @@ def _doubt_times(found: Sequence[Run], longest: float, given: bool) -> None:
     if lasts > MANY_STEPS * longest or (apart > SPARSE * longest and not given):
         warnings.warn(
             f"a record lasts {lasts:.3g} s, with rows {apart:.2g} s apart, which takes {lasts / longest:.2g} steps of "
-            f"{longest:.2g} s: if its times are in ms, or numbers of frames, make them seconds; else give dt",
+            f"{longest:.2g} s: if its times are in ms, or numbers of frames, make them seconds; otherwise give dt",
             stacklevel=4,
         )
 
