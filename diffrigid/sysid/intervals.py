@@ -87,9 +87,7 @@ def _notes(
     exact = [name for name, sigma in problem.noise.items() if sigma <= least_noise(problem, name)]
     if exact:
         names = ", ".join(exact)
-        notes.append(
-            f"residuals of {names} are at rounding level, as for simulated data without noise: intervals mean nothing"
-        )
+        notes.append(f"residuals of {names} are rounding, as for simulated data without noise: intervals mean nothing")
     tested = [column for record in residuals for name, column in record.items() if name not in exact]
     series = [r for column in tested for r in column.T if np.isfinite(r).any()]
     lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
