@@ -22,6 +22,7 @@ from diffrigid.gap import gap
 from diffrigid.impacts import contacts
 from diffrigid.joints import Ball, Distance, Prismatic, Revolute, Weld
 from diffrigid.models import load_mjcf, load_urdf
+from diffrigid.parts import Part
 from diffrigid.pytree import replace
 from diffrigid.saved_scene import load_scene, save_scene
 from diffrigid.scene import Body, Static, scene
@@ -86,6 +87,7 @@ __all__ = [
     "Homography",
     "Hull",
     "Marker",
+    "Part",
     "Pinhole",
     "Player",
     "Polygon",

@@ -7,7 +7,6 @@ Functions that check take the name of the argument first, for their messages. Kn
 import dataclasses
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid import so2
-from diffrigid.moments import volume_properties
 from diffrigid.pytree import map_arrays, refuse_missing, replace, undeclared_fields
 from diffrigid.shapes import HalfSpace, dimension, traced, with_topology
 from diffrigid.state import axis_sizes, rotations
@@ -181,29 +179,21 @@ def angular_velocity(name: str, w: Any, dim: int) -> Numbers:
 
 
 class Solid(NamedTuple):
-    """A shape and its properties; see `volume_properties`."""
+    """Properties of the shape of a body, or of all its parts; see `volume_properties`."""
 
-    shape: Any
     volume: Numbers
     center: Numbers
     gyration: Numbers
+    mass: Numbers | None = None  # [kg] sum of what its parts were given
 
 
-def shape_of(name: str, shape: Any, dim: int) -> Any:
+def shape_of(where: str, shape: Any, dim: int) -> Any:
     """Convert a shape: float leaves, and the topology of a hull filled in."""
     if dimension(shape) not in (None, dim):
         kind = type(shape).__name__
-        raise ValueError(f"{name}.shape is a {kind} of {dimension(shape)}D: use a shape of {dim}D, as the scene.")
+        raise ValueError(f"{where} is a {kind} of {dimension(shape)}D: use a shape of {dim}D, as the scene.")
     shape = map_arrays(lambda leaf, letters, _: _array(leaf), with_topology(shape))
     return replace(shape, normal=shape.normal / _length(shape.normal)) if isinstance(shape, HalfSpace) else shape
-
-
-def solid_of(shape: Any, dim: int) -> Solid | None:
-    """A shape with its properties; None for None."""
-    return None if shape is None else Solid(shape, *known(partial(_volume_properties, dim=dim), shape))
-
-
-_volume_properties = jax.jit(volume_properties, static_argnames="dim")  # one program in place of some dozen
 
 
 def mass_and_inertia(name: str, body: Any, solid: Solid | None, dim: int) -> tuple[Numbers, Numbers]:
@@ -211,12 +201,18 @@ def mass_and_inertia(name: str, body: Any, solid: Solid | None, dim: int) -> tup
 
     With the mass given, the inertia is mass * gyration: that is finite for a rod without volume.
     """
-    if (body.mass is None) == (body.density is None):
+    of_parts = None if solid is None else solid.mass
+    if of_parts is not None and (body.mass is not None or body.density is not None):
+        field = "density" if body.mass is None else "mass"
+        raise ValueError(f"{name}.{field}: its parts have masses already; leave it out, or take theirs away.")
+    if of_parts is None and (body.mass is None) == (body.density is None):
         came = "neither" if body.mass is None else "both"
         raise ValueError(f"{name}: expected either mass [kg] or density, got {came}; give one of them.")
     if solid is None and (body.mass is None or body.inertia is None):
         raise ValueError(f"{name}.shape is None: expected both mass and inertia; give them, or a shape.")
-    if body.mass is not None:
+    if of_parts is not None:
+        mass = of_parts
+    elif body.mass is not None:
         mass = positive(f"{name}.mass", body.mass, "use Static for what does not move")
     else:
         density = positive(f"{name}.density", body.density, "use Static for what does not move")

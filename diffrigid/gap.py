@@ -1,9 +1,10 @@
 """Distance between the surfaces of two bodies, in a state."""
 
-import operator
+import functools
+import itertools
 from typing import Any
 
-import jax
+import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.collide import COLLIDERS
@@ -12,7 +13,7 @@ from diffrigid.pytree import align_all
 from diffrigid.shapes import UNEVEN
 from diffrigid.state import State, rotations
 from diffrigid.step import floats
-from diffrigid.world import World, check
+from diffrigid.world import World, check, seated, seats
 
 
 def gap(world: World, state: State, a: str, b: str) -> Array:
@@ -35,25 +36,29 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
         raise ValueError(f"gap: {a!r} twice: name two bodies, or a body and a static")
     world, state = align_all(*floats(world, state))
     sides = [_placed(world, state, name) for name in (a, b)]
-    for (shape, x, q), (other, x_other, q_other) in (sides, sides[::-1]):
-        if find := COLLIDERS.get((type(shape), type(other))):
-            return find(shape, x, q, other, x_other, q_other).gap.min(0)
-    raise ValueError(f"gap: no distance between {a!r}, and {b!r}, neither of which moves")
+    gaps: list[Array] = []
+    for one, other in itertools.product(*sides):
+        shape, second = (one, other) if (type(one[0]), type(other[0])) in COLLIDERS else (other, one)
+        find = COLLIDERS.get((type(shape[0]), type(second[0])))
+        if find is None:
+            raise ValueError(f"gap: {a!r} and {b!r} are half-spaces, which have no distance: name a body for one.")
+        gaps.append(find(*shape, *second).gap.min(0))
+    return functools.reduce(lambda least, gap: jnp.minimum(least, gap), gaps)
 
 
-def _placed(world: World, state: State, name: str) -> tuple[Any, Array, Array]:
-    """Shape of a body or static, and where its origin is: x (D, *batch) [m], q (Q, *batch)."""
+def _placed(world: World, state: State, name: str) -> list[tuple[Any, Array, Array]]:
+    """Shapes of a body or static, and where their origins are: x (D, *batch) [m], q (Q, *batch)."""
     names = (*world.names, *world.static_names)
     if name not in names:
         raise ValueError(f"gap: {name!r} is neither a body nor a static: {nearest(name, names)}")
     k, moving = names.index(name), len(world.names)
     x, q = (state.x[k], state.q[k]) if k < moving else (world.statics.x[k - moving], world.statics.q[k - moving])
-    for shapes, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
-        if k in owners:
-            row = owners.index(k)
-            if isinstance(shapes, UNEVEN):
-                raise ValueError(f"gap: {name!r} is a {type(shapes).__name__}, to which there is no distance")
-            if offset is not None:
-                x = x + rotations(world.dim).rotate(q, offset.r[row])
-            return jax.tree.map(operator.itemgetter(row), shapes), x, q
-    raise ValueError(f"gap: {name!r} has no shape, from which to find a distance")
+    so, found = rotations(world.dim), []
+    for shape, r, turn in (seated(world, seat) for seat in seats(world) if seat.owner == k):
+        if isinstance(shape, UNEVEN):
+            raise ValueError(f"gap: {name!r} is a {type(shape).__name__}, to which there is no distance")
+        origin = x if r is None else x + so.rotate(q, r)
+        found.append((shape, origin, q if turn is None else so.compose(q, turn)))
+    if not found:
+        raise ValueError(f"gap: {name!r} has no shape, from which to find a distance")
+    return found

@@ -21,7 +21,7 @@ from diffrigid.impulses import Changes, changes_of, impulses_at
 from diffrigid.pytree import replace
 from diffrigid.shapes import UNEVEN, Box, HalfSpace, Hull, edges, radius, vertices
 from diffrigid.tables import lined_up, moment
-from diffrigid.touch import Convex, gaps
+from diffrigid.touch import Convex, gaps, rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.world import World
 
@@ -216,7 +216,9 @@ def _side(world: World, group: int) -> Convex:
         normal = np.asarray(records.normal, float)
         return Convex(None, normal, np.asarray(records.offset, float), (), (), np.full(len(normal), np.inf))
     corners = np.array([vertices(shape, dim) for shape in shapes], float)
-    corners = corners if offset is None else corners + np.asarray(offset.r, float)[:, None]
+    if offset is not None:
+        turned = corners if offset.q is None else rotated(np.asarray(offset.q, float)[:, None], corners)
+        corners = turned + np.asarray(offset.r, float)[:, None]
     rounding = np.array([radius(shape) for shape in shapes], float)
     count = corners.shape[1]
     if dim == 2:

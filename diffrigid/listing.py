@@ -7,7 +7,7 @@ from jax import Array
 
 from diffrigid.paths import catalogue, leaf_of, unit
 from diffrigid.shapes import traced
-from diffrigid.world import World
+from diffrigid.world import World, seats
 
 LISTED = 9  # numbers that are listed, and not only their shape: of an inertia
 
@@ -17,16 +17,18 @@ def listing(world: World) -> str:
     names = world.names + world.static_names
     lines: dict[str, list[str]] = {}
     kinds: dict[str, Any] = dict(zip(world.force_names, world.forces, strict=True)) | {"contact": world.contact}
-    for of_kind, joint in zip(world.joint_names, world.joints, strict=True):
-        kinds |= dict.fromkeys(of_kind, joint)
-    for shape, owners in zip(world.shapes, world.owners, strict=True):
-        kinds |= {names[owner]: shape for owner in owners}
+    for joints, joint in zip(world.joint_names, world.joints, strict=True):
+        kinds |= dict.fromkeys(joints, joint)
+    of_shapes: dict[str, list[str]] = {}
+    for seat in seats(world):
+        of_shapes.setdefault(names[seat.owner], []).append(type(world.shapes[seat.group]).__name__)
     for path, (place, *_) in catalogue(world).items():
         owner, _, field = path.partition(".")
-        if field and place.chain[0] == 0 and not (place.angle or place.shape):
+        if field and place.chain[0] == 0 and not (place.angle or place.solid):
             value, measure = _shown(leaf_of((world, None), place), place.row), unit(world, path)
             lines.setdefault(owner, []).append(f"{field.removeprefix('shape.')} {value} {measure}".rstrip())
-    kind = {owner: f" ({type(kinds[owner]).__name__})" if owner in kinds else "" for owner in lines}
+    of_kind = {owner: [type(record).__name__] for owner, record in kinds.items()} | of_shapes
+    kind = {owner: f" ({', '.join(of_kind[owner])})" if owner in of_kind else "" for owner in lines}
     listed = [f"{owner}{kind[owner]}: {', '.join(values)}" for owner, values in lines.items()]
     return "\n".join([f"World, {world.dim}D", *listed])
 

@@ -1,13 +1,16 @@
 """Volume, centre of mass and inertia of solid shapes. Letters: D space (2 or 3), V vertices, F faces."""
 
 import math
+from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from diffrigid.linear import einsum, matmul
 from diffrigid.shapes import Box, Capsule, Disc, Hull, Polygon, Shape, Sphere, dimension, floats, with_topology
+from diffrigid.state import rotations
 
 _BALL = (1.0, 2.0, math.pi, 4 * math.pi / 3)  # volume of the unit ball by dimension
 
@@ -21,8 +24,40 @@ def volume_properties(shape: Shape, dim: int) -> tuple[Array, Array, Array]:
         name = type(shape).__name__
         raise ValueError(f"this {name} is {dimension(shape)}D but dim is {dim}: use a shape of {dim}D.")
     volume, center, second = _moments(shape, dim)
+    return volume, center, _gyration(second, dim)
+
+
+def assembly_properties(
+    shapes: Sequence[Shape], x: Sequence[Array], q: Sequence[Array | None], masses: Sequence[Array] | None, dim: int
+) -> tuple[Array, Array, Array]:
+    """Properties of several shapes as one solid, like `volume_properties`: parallel axes (Steiner).
+
+    Args:
+        x: (D,) [m] of each origin. q: (Q,) of each shape, None: unturned.
+        masses: () [kg] of each; None: all have the same density.
+    """
+    so = rotations(dim)
+    volumes, centers, seconds = [], [], []
+    for shape, at, turn in zip(shapes, x, q, strict=True):
+        volume, center, second = _moments(shape, dim)
+        if turn is not None:
+            R = jax.vmap(so.rotate, (None, 1), 1)(turn, jnp.eye(dim, dtype=center.dtype))
+            center, second = matmul(R, center), matmul(matmul(R, second), R.T)
+        volumes.append(volume)
+        centers.append(at + center)
+        seconds.append(second)
+    weights = jnp.stack(volumes if masses is None else masses)
+    share, places = weights / weights.sum(), jnp.stack(centers)
+    center = matmul(share, places)
+    away = places - center[None]
+    second = einsum("p,pij->ij", share, jnp.stack(seconds)) + einsum("p,pi,pj->ij", share, away, away)
+    return sum(volumes), center, _gyration(second, dim)
+
+
+def _gyration(second: Array, dim: int) -> Array:
+    """Inertia per mass [m^2], () or (3, 3), from the second moment per mass (D, D) [m^2]."""
     spread = (second * np.eye(dim, dtype=second.dtype)).sum()
-    return volume, center, spread if dim == 2 else spread * np.eye(3, dtype=second.dtype) - second
+    return spread if dim == 2 else spread * np.eye(3, dtype=second.dtype) - second
 
 
 def _moments(shape, dim):

@@ -7,18 +7,15 @@ two vertices (separating axes). For cores that overlap it is minus the least tra
 
 import itertools
 import warnings
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from diffrigid.convert import known
 from diffrigid.shapes import UNEVEN, HalfSpace, edges, radius, traced, vertices
-from diffrigid.state import State
+from diffrigid.state import State, rotations
 from diffrigid.touch import rotated
-
-if TYPE_CHECKING:
-    from diffrigid.world import World
+from diffrigid.world import World, seated, seats
 
 DEEP = 1e-4  # [-] of the smaller size: penetration at the start that is worth a warning
 
@@ -91,25 +88,29 @@ def _across(a: Outline, b: Outline) -> np.ndarray:
     return (to - share[:, :, None] * b.sides).reshape(-1, 3)
 
 
-def warn_of_overlap(world: "World", state: State, shapes: Mapping, solids: Mapping) -> None:
+def warn_of_overlap(world: World, state: State) -> None:
     """Warn of pairs that penetrate at the start, except those with uneven ground or a traced value."""
     poses = [*zip(state.x, state.q, strict=True), *zip(world.statics.x, world.statics.q, strict=True)]
     placed = {}
-    for index, ((name, shape), (x, q)) in enumerate(zip(shapes.items(), poses, strict=True)):
-        solid = solids.get(name)
-        center = np.zeros(world.dim) if solid is None else solid.center
-        if shape is not None and not isinstance(shape, UNEVEN) and not traced((shape, center, x, q)):
-            placed[index] = place(shape, x, q, center)
-    pairs = [pair for group in world.pairs for pair in zip(group.a, group.b, strict=True)]
-    if world.crowd:
-        pairs = near_pairs(placed, len(world.names))
+    for seat in seats(world):
+        shape, r, turn = seated(world, seat)
+        x, q = poses[seat.owner]
+        if not isinstance(shape, UNEVEN) and not traced((shape, r, turn, x, q)):
+            x = x if r is None else x + rotated(q, r)
+            q = q if turn is None else known(rotations(world.dim).compose, q, turn)
+            placed[seat.owner, seat.group, seat.row] = place(shape, x, q, np.zeros(world.dim))
+    pairs: list = near_pairs(placed, len(world.names)) if world.crowd else []
+    for group in world.pairs:
+        sides = ((group.a, group.shape_a, group.row_a), (group.b, group.shape_b, group.row_b))
+        pairs += zip(*(zip(on, [kind] * len(on), row, strict=True) for on, kind, row in sides), strict=True)
     if deep := overlapping(placed, pairs):
-        names = list(shapes)
-        text = ", ".join(f"{names[i]} and {names[j]}" for i, j in sorted(deep))
+        names = world.names + world.static_names
+        both = sorted({(min(i[0], j[0]), max(i[0], j[0])) for i, j in deep})
+        text = ", ".join(f"{names[i]} and {names[j]}" for i, j in both)
         warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore.", stacklevel=3)
 
 
-def overlapping(colliders: dict[int, Outline], pairs: list) -> list[tuple[int, int]]:
+def overlapping(colliders: dict[tuple, Outline], pairs: list) -> list[tuple[tuple, tuple]]:
     """Pairs (i, j) of keys of `colliders` that penetrate deeply."""
     size = {key: collider.size for key, collider in colliders.items()}
     centre = {key: collider.corners.mean(0) for key, collider in colliders.items()}
@@ -121,19 +122,19 @@ def overlapping(colliders: dict[int, Outline], pairs: list) -> list[tuple[int, i
     return deep
 
 
-def near_pairs(colliders: dict[int, Outline], moving: int) -> list[tuple[int, int]]:
+def near_pairs(colliders: dict[tuple, Outline], moving: int) -> list[tuple[tuple, tuple]]:
     """All pairs that may overlap: bounded ones in the same or adjacent cells of a grid, and those with half-spaces.
 
-    The first of each pair is below `moving`.
+    Keys begin with the number of the collider; that of the first of each pair is below `moving`.
     """
     round_ones = {key: collider for key, collider in colliders.items() if collider.normal is None}
-    pairs = [(i, j) for i in round_ones if i < moving for j in colliders if j not in round_ones]
+    pairs = [(i, j) for i in round_ones if i[0] < moving for j in colliders if j not in round_ones]
     side = 2.0 * max((collider.size for collider in round_ones.values()), default=1.0)
-    cells: dict[tuple, list[int]] = {}
+    cells: dict[tuple, list[tuple]] = {}
     for key, collider in round_ones.items():
         cells.setdefault(tuple(np.floor(collider.corners[0] / side).astype(int).tolist()), []).append(key)
     for cell, keys in cells.items():
         around = itertools.product(*((k - 1, k, k + 1) for k in cell))
         others = [key for there in around for key in cells.get(there, [])]
-        pairs += [(i, j) for i in keys for j in others if i < j and i < moving]
+        pairs += [(i, j) for i in keys for j in others if i < j and i[0] < moving]
     return pairs

@@ -7,6 +7,7 @@ FORCE.field                              a force of the scene, by its name: "dra
 JOINT.field                              a joint of the scene, by its name: "revolute.anchor_a"
 JOINT.angle | rate, JOINT.translation | rate    initial state of a hinge, of a slider, and of all attached to it
 BODY.mass | inertia | restitution | friction | ... | shape.FIELD
+BODY.shape.PART.FIELD | x | angle | q    one of several shapes, and where it sits: x from the centre of mass, body axes
 BODY.density                             of a body that is solid: sets its mass, and its inertia by its shape
 BODY.x | v | q | w | angle               initial state (angle: 2D)
 STATIC.x | q | angle | restitution | friction | ... | shape.FIELD
@@ -29,11 +30,11 @@ from diffrigid import joint_motion, so2
 from diffrigid.convert import Numbers, known, nearest, numbers
 from diffrigid.forces import Gravity
 from diffrigid.joints import Revolute
-from diffrigid.moments import volume_properties
+from diffrigid.moments import assembly_properties, volume_properties
 from diffrigid.pytree import array_fields, letters_of, replace
-from diffrigid.shapes import BOUNDLESS, traced
+from diffrigid.shapes import traced
 from diffrigid.state import COEFFICIENTS, State
-from diffrigid.world import World
+from diffrigid.world import Seat, World, seated, seats
 
 UNITS = {
     "mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2", "g": "m/s^2",
@@ -58,7 +59,7 @@ class Place(NamedTuple):
     row: int | None  # None: all of it
     angle: bool = False  # the leaf is q, the value an angle
     joint: tuple[str, str] | None = None  # name and "angle", "translation" or "rate": the leaf moves with the joint
-    shape: tuple[int, int] | None = None  # group and row of a shape: the value is its density
+    solid: tuple[Seat, ...] = ()  # shapes of a body: the value is their density
 
 
 class Catalogue(dict[str, list[Place]]):
@@ -87,8 +88,8 @@ def read(world: World, state: State, path: str) -> Array:
     place = places(world, path)[0]
     if place.joint:
         return joint_motion.read(world, state, *place.joint)
-    if place.shape:
-        return world.bodies.mass[place.row] / _solid(world, *place.shape)[0]
+    if place.solid:
+        return world.bodies.mass[place.row] / _solid(world, place.solid)[0]
     leaf = leaf_of((world, state), place)
     value: Any = leaf if place.row is None else _row(leaf, place.row)
     if path in COEFFICIENTS:
@@ -115,12 +116,12 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
         vector = read(world, state, whole)
         part = numbers(path, value, _item(vector, whole, index).shape, finite=False)
         return write(world, state, whole, _with_rows(vector, index, part.astype(vector.dtype)))
-    if (place := places(world, path)[0]).joint or place.shape:
+    if (place := places(world, path)[0]).joint or place.solid:
         number = jnp.asarray(numbers(path, value, (), finite=False), state.x.dtype)
     if place.joint:
         return world, joint_motion.write(world, state, *place.joint, number)
-    if place.shape:
-        volume, gyration = _solid(world, *place.shape)
+    if place.solid:
+        volume, gyration = _solid(world, place.solid)
         bodies, mass = world.bodies, number * volume
         mass, inertia = bodies.mass.at[place.row].set(mass), bodies.inertia.at[place.row].set(mass * gyration)
         return replace(world, bodies=replace(bodies, mass=mass, inertia=inertia)), state
@@ -156,12 +157,16 @@ def order_of(world: World, path: str) -> int:
     """Rank in which to set a parameter: shapes before densities, all before joints, and their rates last."""
     known = catalogue(world).get(component(path)[0], [])
     place = known[0] if known else Place((), None)
-    return (2 + (place.joint[1] == joint_motion.RATE)) if place.joint else int(place.shape is not None)
+    return (2 + (place.joint[1] == joint_motion.RATE)) if place.joint else int(bool(place.solid))
 
 
-def _solid(world: World, group: int, row: int) -> tuple[Array, Array]:
-    """Volume [m^D] and inertia over mass [m^2] of a shape."""
-    volume, _, gyration = volume_properties(jax.tree.map(lambda leaf: leaf[row], world.shapes[group]), world.dim)
+def _solid(world: World, solid: tuple[Seat, ...]) -> tuple[Array, Array]:
+    """Volume [m^D] and inertia over mass [m^2] of the shapes of a body."""
+    shapes, r, q = zip(*(seated(world, seat) for seat in solid), strict=True)
+    if len(solid) == 1:
+        volume, _, gyration = volume_properties(shapes[0], world.dim)
+    else:
+        volume, _, gyration = assembly_properties(shapes, r, q, None, world.dim)
     return volume, gyration
 
 
@@ -237,14 +242,32 @@ def catalogue(world: World) -> Catalogue:
         if world.dim == 2:
             out[f"{name}.angle"] = [Place((0, "statics", "q"), row, angle=True)]
     names = world.names + world.static_names
-    for group, (shape, owners) in enumerate(zip(world.shapes, world.owners, strict=True)):
-        for row, owner in enumerate(owners):
-            if owner < len(world.names) and not isinstance(shape, BOUNDLESS):
-                of_density = [(0, "bodies", leaf) for leaf in ("mass", "inertia")]
-                out[f"{names[owner]}.density"] = [Place(leaf, owner, shape=(group, row)) for leaf in of_density]
-            for field in array_fields(shape):
-                out[f"{names[owner]}.shape.{field}"] = [Place((0, "shapes", group, field), row)]
+    solids: dict[int, tuple[Seat, ...]] = {}
+    for seat in seats(world):
+        solids[seat.owner] = (*solids.get(seat.owner, ()), seat)
+    for owner, solid in solids.items():
+        if owner < len(world.names):
+            of_density = [(0, "bodies", leaf) for leaf in ("mass", "inertia")]
+            out[f"{names[owner]}.density"] = [Place(leaf, owner, solid=solid) for leaf in of_density]
+        for seat in solid:
+            out |= _of_shape(world, seat, f"{names[owner]}.shape")
     return out
+
+
+def _of_shape(world: World, seat: Seat, path: str) -> dict[str, list[Place]]:
+    """Places of a shape: its dimensions and, of one of several, where it sits on its body."""
+    fields = {
+        field: Place((0, "shapes", seat.group, field), seat.row) for field in array_fields(world.shapes[seat.group])
+    }
+    if seat.part:
+        path = f"{path}.{seat.part}"
+        fields["x"] = Place((0, "offsets", seat.group, "r"), seat.row)
+        if world.offsets[seat.group].q is not None:
+            turn = (0, "offsets", seat.group, "q")
+            fields["q"] = Place(turn, seat.row)
+            if world.dim == 2:
+                fields["angle"] = Place(turn, seat.row, angle=True)
+    return {f"{path}.{field}": [place] for field, place in fields.items()}
 
 
 def leaf_of(pair: tuple[World, Any], place: Place) -> Any:

@@ -20,17 +20,15 @@ from diffrigid.convert import (
     nearest,
     numbers,
     orientation,
-    shape_of,
-    solid_of,
     stack,
 )
 from diffrigid.forces import Gravity
 from diffrigid.joint_checks import joints_of, warn_of_torn_joints
 from diffrigid.overlap import warn_of_overlap
+from diffrigid.parts import Part, check_shapes, dimensions, pieces_of, solid_of
 from diffrigid.pytree import map_arrays, refuse_missing
-from diffrigid.shape_checks import check_shape
 from diffrigid.shape_records import contact_count, looking_around, stack_shapes
-from diffrigid.shapes import BOUNDLESS, Shape, dimension, traced
+from diffrigid.shapes import BOUNDLESS, Shape, traced
 from diffrigid.state import COEFFICIENTS, Bodies, State, rotations
 from diffrigid.world import Statics, World
 
@@ -44,10 +42,12 @@ class Body:
     """A moving body, and its initial state.
 
     Args:
-        shape: a shape, or None for a body without geometry, which needs `mass` and `inertia`.
-        mass: [kg]; or density: [kg/m^2] in 2D, [kg/m^3] in 3D. One of the two.
+        shape: a shape; several by name, {"head": Part(...)}; or None for a body without geometry, which needs `mass`
+            and `inertia`.
+        mass: [kg]; or density: [kg/m^2] in 2D, [kg/m^3] in 3D. One of the two, unless its parts have masses.
         inertia: [kg m^2] about the centre of mass, body axes: a number in 2D; three principal values or a
             (3, 3) matrix in 3D. Default: that of the shape, uniform.
+        center: [m] centre of mass in the axes of its parts; then give inertia. Default: that of the solid, uniform.
         x: [m] centre of mass. v: [m/s]. w: [rad/s], world frame, a number in 2D.
         angle: [rad] (2D), or q: (cos, sin) in 2D, unit quaternion (w, x, y, z) in 3D. Default: unturned.
         restitution, friction and the other coefficients: default: those of the scene.
@@ -58,11 +58,12 @@ class Body:
         0.25
     """
 
-    shape: Shape | None
+    shape: Shape | Mapping[str, Part | Shape] | None
     _: KW_ONLY
     mass: Any = None
     density: Any = None
     inertia: Any = None
+    center: Any = None
     x: Any = None
     v: Any = None
     angle: Any = None
@@ -147,16 +148,16 @@ def scene(
     named_forces = _forces(forces, gravity, everything, moving, dim)
     joined, linked, joint_names = _joints(joints, named_forces, moving, still, dim)
     passing = _passing([*_listed(ignore), *joined], list(everything))
-    shapes = {k: None if b.shape is None else shape_of(k, b.shape, dim) for k, b in everything.items()}
-    shapes |= looking_around(shapes, moving)
-    solids = {name: solid_of(shapes[name], dim) for name in moving}
-    records, offsets, owners = stack_shapes(shapes, solids, dim)
+    pieces = {name: pieces_of(name, body.shape, dim) for name, body in everything.items()}
+    pieces |= looking_around(pieces, moving)
+    solids = {name: solid_of(name, body, pieces[name], dim) for name, body in moving.items()}
+    records, offsets, owners, parts = stack_shapes(pieces, solids, dim)
     kinds = [type(record) for record in records]
     numbers_of_all = restitution, friction, restitution_falloff, rolling_friction, spinning_friction
     material = materials(everything, dict(zip(COEFFICIENTS, numbers_of_all, strict=True)))
     if dim == 2 and "spinning_friction" in material:
         raise ValueError("spinning_friction: in 2D nothing turns about a normal; give rolling_friction.")
-    crowd = is_many(kinds, owners, n, not (named_forces or linked or passing or {*material} & TURNING))
+    crowd = is_many(kinds, owners, n, not (named_forces or linked or passing or parts or {*material} & TURNING))
     pairs: tuple = ()
     if not crowd:
         pairs = pair_groups(kinds, owners, n, passing, COLLIDERS, partial(contact_count, records, dim))
@@ -165,14 +166,14 @@ def scene(
     made = World(
         bodies=Bodies(mass=stack(mass), inertia=stack(inertia), dim=dim, **of_bodies),
         statics=Statics(**_poses(still, dim), **of_statics),
-        shapes=records, offsets=offsets, owners=owners, pairs=pairs, crowd=crowd,
+        shapes=records, offsets=offsets, owners=owners, parts=parts, pairs=pairs, crowd=crowd,
         forces=tuple(named_forces.values()), force_names=tuple(named_forces),
         joints=linked, joint_names=joint_names,
         contact=_contact(Contact() if contact is None else contact),
         names=tuple(moving), static_names=tuple(still), own=tuple((k, own) for k, (_, own) in material.items()),
     )  # fmt: skip
     start = _state(moving, dim)
-    warn_of_overlap(made, start, shapes, solids)
+    warn_of_overlap(made, start)
     if not traced((made, start)):
         warn_of_torn_joints(made, start)
     return jax.tree.map(jax.device_put, (made, start))
@@ -193,12 +194,14 @@ def _sorted(bodies: Mapping[str, Body | Static]) -> tuple[dict[str, Body], dict[
             raise ValueError(f"bodies: {name!r} is not a name: expected a string without dots, not {taken}; rename it.")
         if isinstance(body, Static) and body.shape is None:
             raise ValueError(f"{name}.shape is None: expected a shape; leave out a Static without one.")
+        if isinstance(body, Static) and isinstance(body.shape, Mapping):
+            raise ValueError(f"{name}.shape has parts: expected one shape; give each part a Static of its own.")
         if isinstance(body, Body) and isinstance(body.shape, BOUNDLESS):
             raise ValueError(f"{name}.shape is a {type(body.shape).__name__}, which has no mass: make {name} a Static.")
         if isinstance(body, Body) and body.x is None:
             raise ValueError(f"{name}.x is missing: expected the centre of mass, (2,) or (3,) [m]; give x.")
         if body.shape is not None:
-            check_shape(body.shape, f"{name}.shape")
+            check_shapes(name, body.shape)
     moving = {name: body for name, body in bodies.items() if isinstance(body, Body)}
     if not moving:
         raise ValueError(f"bodies has no Body, only {list(bodies)}: expected one that moves; add a Body.")
@@ -230,8 +233,7 @@ def _dimension(moving: Mapping[str, Body], gravity: Any) -> int:
     sizes = {} if gravity is None else {"gravity": _length("gravity", gravity)}
     for name, body in moving.items():
         sizes[f"{name}.x"] = _length(f"{name}.x", body.x)
-        if body.shape is not None and (size := dimension(body.shape)):
-            sizes[f"{name}.shape"] = size
+        sizes |= dimensions(name, body.shape)
     if len(set(sizes.values())) > 1:
         raise ValueError(f"a scene is all 2D or all 3D, but got {sizes}: use the same number of components.")
     return next(iter(sizes.values()))

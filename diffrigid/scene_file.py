@@ -8,6 +8,12 @@ shape = { disc = { radius = 0.1 } }
 mass = 1.0
 x = [0.0, 1.0]
 
+[bodies.hammer]                             # a body of several shapes
+mass = 0.5
+x = [1.0, 1.0]
+parts.handle = { shape = { box = { half = [0.15, 0.01] } } }
+parts.head = { shape = { box = { half = [0.02, 0.05] } }, x = [0.15, 0.0] }
+
 [statics.floor]
 shape = { half_space = { normal = [0.0, 1.0] } }
 
@@ -47,6 +53,7 @@ from typing import Any
 from diffrigid import forces, joints, shapes, sysid
 from diffrigid.contact import Contact
 from diffrigid.convert import nearest
+from diffrigid.parts import Part
 from diffrigid.scene import Body, Static, scene
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
@@ -139,9 +146,23 @@ def _column(where: str, entry: Any) -> tuple[str, float]:
 def _body(where: str, kind: Any, entry: Any) -> Any:
     if not isinstance(entry, Mapping):
         raise ValueError(f"{where} is {entry!r}: expected a table with a shape")
-    shape = entry.get("shape")
-    made = None if shape is None else _one_of(f"{where}.shape", SHAPES, shape)
-    return _made(where, kind, {"shape": made, **{k: v for k, v in entry.items() if k != "shape"}})
+    shape, parts, made = entry.get("shape"), entry.get("parts"), None
+    if shape is not None and parts is not None:
+        raise ValueError(f"{where}: got both a shape and parts: move the shape to the parts")
+    if shape is not None:
+        made = _one_of(f"{where}.shape", SHAPES, shape)
+    if parts is not None:
+        if not isinstance(parts, Mapping):
+            raise ValueError(f"{where}.parts is {parts!r}: expected a table of parts by name")
+        made = {name: _part(f"{where}.parts.{name}", part) for name, part in parts.items()}
+    return _made(where, kind, {"shape": made, **{k: v for k, v in entry.items() if k not in ("shape", "parts")}})
+
+
+def _part(where: str, entry: Any) -> Part:
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"{where} is {entry!r}: expected a table with a shape")
+    shape = _one_of(f"{where}.shape", SHAPES, entry.get("shape"))
+    return _made(where, Part, {**entry, "shape": shape})
 
 
 def _one_of(where: str, kinds: Mapping[str, Callable], entry: Any) -> Any:

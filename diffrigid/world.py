@@ -1,7 +1,8 @@
 """`World`: everything that a step does not change, and the checks of shape and type."""
 
 import functools
-from typing import Any
+import operator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,6 +55,7 @@ class World:
     force_names: tuple[str, ...] = static()
     joint_names: tuple[tuple[str, ...], ...] = static()  # of the rows of each record of `joints`
     owners: tuple[tuple[int, ...], ...] = static()
+    parts: tuple[tuple[str, ...], ...] = static(default=())  # names, as `owners`; () if no body has several shapes
     pairs: tuple[PairGroup, ...] = static()
     crowd: bool = static(default=False)  # so many bodies that pairs are found in every step instead of listed
     # of each coefficient, whether it was given to each collider itself, and is not the scene's default
@@ -73,9 +75,34 @@ class World:
 
 @pytree
 class Offset:
-    """Where the origins of M shapes of one kind sit on their bodies."""
+    """Where M shapes of one kind sit on their bodies."""
 
-    r: Array = array("M", "D")  # (M, D, *batch) [m] from the centre of mass, body axes
+    r: Array = array("M", "D")  # (M, D, *batch) [m] their origins from the centre of mass, body axes
+    q: Any = array("M", "Q", default=None)  # (M, Q, *batch) from their axes to body axes; None: unturned
+
+
+class Seat(NamedTuple):
+    """A row of `World.shapes`, and the collider that it sits on."""
+
+    group: int
+    row: int
+    owner: int
+    part: str  # its name; "" of the only shape
+
+
+def seats(world: World) -> list[Seat]:
+    """All shapes of a world."""
+    return [
+        Seat(group, row, owner, world.parts[group][row] if world.parts else "")
+        for group, owners in enumerate(world.owners)
+        for row, owner in enumerate(owners)
+    ]
+
+
+def seated(world: World, seat: Seat) -> tuple[Any, Any, Any]:
+    """A shape, its origin (D, *batch) [m] on its collider, and its orientation (Q, *batch); None: at x, unturned."""
+    shape, offset = jax.tree.map(operator.itemgetter(seat.row), (world.shapes[seat.group], world.offsets[seat.group]))
+    return (shape, None, None) if offset is None else (shape, offset.r, offset.q)
 
 
 def check_kinds(world: Any, state: Any) -> None:

@@ -228,9 +228,22 @@ LEFT_OUT = {
     "margin": (mjcf(BALL.replace("size", 'name="g" margin="0.1" size')), "margin of geom 'g'"),
     "a full turn": (mjcf('<body name="a"><joint name="j" range="-180 180"/><geom size="0.1" pos="1 0 0"/></body>'), "lower limit -3.14159 rad and upper limit 3.14159 rad of j"),
     "a limit a turn away": (mjcf('<body name="a"><joint name="j" range="300 400"/><geom size="0.1" pos="1 0 0"/></body>'), "lower limit 5.23599 rad and upper"),
-    "second geom": (mjcf(BALL.replace("</body>", '<geom name="g2" size="0.1"/></body>')), "g2, the second shape of ball"),
-    "off centre": (mjcf(BALL.replace("<geom", '<inertial pos="1 0 0" mass="1" diaginertia="1 1 1"/><geom name="g"')), "g, which is off the centre"),
+    "friction of a second geom": (mjcf(BALL.replace("</body>", '<geom name="g2" size="0.1" friction="0.3"/></body>').replace("<geom size", '<geom name="g" size')), "the friction of all shapes of ball but g"),
 }  # fmt: skip
+
+
+def test_all_geoms_of_a_body_collide(write):
+    """A hammer whose head is turned, off the centre of mass: each corner is where MuJoCo has it."""
+    hammer = (
+        '<body name="hammer" pos="0 0 1" euler="0 0 30"><freejoint/><inertial pos="0.1 0 0" mass="1" diaginertia="1 2 2"/>'
+        '<geom name="handle" type="capsule" fromto="-0.2 0 0 0.2 0 0" size="0.02"/>'
+        '<geom name="head" type="box" pos="0.2 0 0" euler="0 90 0" size="0.1 0.02 0.03"/></body>'
+    )
+    world, state = dr.load_mjcf(write(mjcf('<geom name="floor" type="plane" size="1 1 1"/>' + hammer)))
+    assert_allclose(state.x[0], [0.1 * np.cos(np.pi / 6), 0.1 * np.sin(np.pi / 6), 1.0], rtol=SAME)
+    assert_allclose(dr.gap(world, state, "hammer", "floor"), 0.9, rtol=SAME)  # the long side of the head, turned down
+    assert_allclose(read(world, state, "hammer.shape.head.x"), [0.1, 0.0, 0.0], atol=SAME)
+    assert_allclose(read(world, state, "hammer.shape.handle.x"), [-0.1, 0.0, 0.0], atol=SAME)
 
 
 @pytest.mark.parametrize("case", LEFT_OUT)

@@ -37,7 +37,7 @@ def pair_groups(kinds, owners, moving: int, ignore, table, count) -> tuple[PairG
     rows.sort(key=lambda row: row[2])
     for i, first in enumerate(rows):
         for second in rows[i + 1 :]:
-            if first[2] >= moving or frozenset((first[2], second[2])) in ignore:
+            if first[2] >= moving or first[2] == second[2] or frozenset((first[2], second[2])) in ignore:
                 continue
             a, b = _ordered(first, second, kinds, table)
             key = (a[0], b[0], a[2] < moving, b[2] < moving)  # statics form groups of their own

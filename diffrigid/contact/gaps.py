@@ -84,4 +84,6 @@ def at_corners(a: Side, at: Placed, contacts: Contacts, of_corners: Array) -> Ar
 def _corners(a: Side, dim: int) -> Array:
     """Vertices of the core of a from its centre of mass, body axes, (V, D, *batch) [m]."""
     r = vertices(a.shape, dim)
+    if a.turn is not None:
+        r = jax.vmap(rotations(dim).rotate, (None, 0))(a.turn, r)
     return r if a.offset is None else r + a.offset[None]

@@ -33,13 +33,14 @@ from diffrigid.contact.sides import (
     earliest,
     gap_rates,
     gap_rounding,
+    is_ball,
     moving_along,
     place,
     reach_of,
     smaller_size,
 )
 from diffrigid.numerics import FOUND, dot, implicit_root, norm, normalise, safe_divide, safe_sqrt, softplus
-from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Shape, Sphere
+from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
 
 AT_ONCE = 1e-8  # [-] of the smaller size: contacts whose gaps differ by no more, or by their rounding, strike at once
@@ -62,7 +63,7 @@ def find_impact(
     """
     live, begin = opaque_true(t1), earliest(a, b)[0]
     varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
-    if closed_form(a.shape, b.shape, straight) and not varying:
+    if closed_form(a, b, straight) and not varying:
         s0, level, found, _ = unfused(live, approach, a, b, width)
         rests = round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
     else:
@@ -123,9 +124,9 @@ def approach(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array
     return _approach_parabola(a, b, width) if isinstance(b.shape, HalfSpace) else _approach_straight(a, b, width)
 
 
-def closed_form(a: Shape, b: Shape, straight: bool) -> bool:
-    """Whether the impact time of two shapes has a closed form; `straight`: relative paths are straight lines."""
-    return isinstance(a, Disc | Sphere) and (isinstance(b, HalfSpace) or (isinstance(b, Disc | Sphere) and straight))
+def closed_form(a: Side, b: Side, straight: bool) -> bool:
+    """Whether the impact time of two colliders has a closed form; `straight`: relative paths are straight lines."""
+    return is_ball(a) and (isinstance(b.shape, HalfSpace) or (is_ball(b) and straight))
 
 
 def _approach_straight(a: Side, b: Side, width: Array | None) -> tuple[Array, Array, Array, Array]:

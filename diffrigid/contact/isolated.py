@@ -47,7 +47,9 @@ def goes_in_rounds(world: "World") -> bool:
 
     def solved(pairs: PairGroup) -> bool:
         straight = relative_path_is_straight(world, max(pairs.a + pairs.b) < moving)
-        return closed_form(world.shapes[pairs.shape_a], world.shapes[pairs.shape_b], straight)
+        kinds = pairs.shape_a, pairs.shape_b
+        a, b = (Side(flight=None, shape=world.shapes[kind], offset=world.offsets[kind]) for kind in kinds)
+        return closed_form(a, b, straight)
 
     one_disc_each = len({kind for kind, _ in bodies}) == 1 and sorted(o for _, o in bodies) == list(range(moving))
     quiet = is_constant(world.forces) and not world.joints and not is_rolling(world)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.branches import any_world
-from diffrigid.contact.sums import at_colliders, body_sides
+from diffrigid.contact.sums import alike, at_colliders, body_sides
 from diffrigid.gathers import rows
 from diffrigid.pytree import array, pytree, replace
 
@@ -101,6 +101,28 @@ def in_order(
         )
         start += len(m.s)
     return ordered
+
+
+def at_once(meetings: list[Meeting], a: tuple[int, ...], b: tuple[int, ...]) -> list[Meeting]:
+    """Let all shapes of two colliders meet when the first of them do, as the corners of one shape do.
+
+    Args:
+        meetings: of the pairs of shapes, between the colliders a and b (P,).
+    """
+    members = alike(tuple(tuple(sorted(pair)) for pair in zip(a, b, strict=True)))
+    if len(members[0]) == 1:
+        return meetings
+    s, fast, hit = (jnp.concatenate([getattr(m, name) for m in meetings]) for name in ("s", "fast", "hit"))
+    impacts = jnp.where(fast, s, jnp.inf)
+    first = rows(jnp.concatenate([impacts, jnp.full_like(s[:1], jnp.inf)]), members).min(1)
+    strikes = first < jnp.inf
+    s, fast, hit = jnp.where(strikes, first, s), fast | strikes, hit | strikes
+    together, start = [], 0
+    for m in meetings:
+        own = slice(start, start + len(m.s))
+        together.append(replace(m, s=s[own], fast=fast[own], hit=hit[own]))
+        start += len(m.s)
+    return together
 
 
 def hanging_together(on: Array, links: Links) -> Array:

@@ -33,6 +33,7 @@ class Side:
     since: Any = array(default=None)  # [s] earliest time for which the path holds
     shape: Any
     offset: Any = array("D", default=None)  # [m] shape origin from the centre of mass, body axes
+    turn: Any = array("Q", default=None)  # from the shape's own axes to body axes
     supported: Any = array(default=None)  # bool: it rests on something where its path begins; None: not asked for
     x: Any = array("D", default=None)
     q: Any = array("Q", default=None)
@@ -75,11 +76,12 @@ def side_of(world: "World", flight: Flight, since: Array, kind: int, shape_rows:
         return jax.tree.map(lambda leaf: rows(leaf, index), tree)
 
     shape, offset = chosen((world.shapes[kind], world.offsets[kind]), shape_rows)
-    offset = None if offset is None else offset.r
-    if min(colliders) < moving:
-        return Side(flight=chosen(flight, colliders), since=chosen(since, colliders), shape=shape, offset=offset)
-    x, q = chosen((world.statics.x, world.statics.q), tuple(i - moving for i in colliders))
-    return Side(flight=None, shape=shape, offset=offset, x=x, q=q)
+    if min(colliders) >= moving:
+        x, q = chosen((world.statics.x, world.statics.q), tuple(i - moving for i in colliders))
+        return Side(flight=None, shape=shape, x=x, q=q)
+    r, turn = (None, None) if offset is None else (offset.r, offset.q)
+    path = chosen((flight, since), colliders)
+    return Side(flight=path[0], since=path[1], shape=shape, offset=r, turn=turn)
 
 
 @jax.jit
@@ -132,6 +134,11 @@ def have_faces(a: type, b: type) -> bool:
     return b is not HalfSpace and not {a, b} & {Disc, Sphere, Capsule}
 
 
+def is_ball(side: Any) -> bool:
+    """Whether a collider, with `shape` and `offset`, is a disc or sphere about its centre of mass. Static."""
+    return isinstance(side.shape, Disc | Sphere) and side.offset is None
+
+
 def contacts_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
     """Contacts of the pair where its colliders are placed."""
     return COLLIDERS[type(a.shape), type(b.shape)](a.shape, *_origin(a, at_a), b.shape, *_origin(b, at_b))
@@ -147,7 +154,9 @@ def candidates_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
 def _origin(side: Side, at: Placed) -> tuple[Array, Array]:
     if side.offset is None:
         return at.x, at.q
-    return at.x + rotations(at.x.shape[0]).rotate(at.q, side.offset), at.q
+    so = rotations(at.x.shape[0])
+    x = at.x + so.rotate(at.q, side.offset)
+    return x, at.q if side.turn is None else so.compose(at.q, side.turn)
 
 
 def relative_velocity(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:

@@ -19,7 +19,7 @@ from diffrigid.contact.impulse import effective_matrix
 from diffrigid.contact.levers import acceleration, by_spin, levers, with_rates
 from diffrigid.contact.materials import material, mixed
 from diffrigid.contact.nearing import EXACT_BEYOND
-from diffrigid.contact.order import Links, Meeting, in_order
+from diffrigid.contact.order import Links, Meeting, at_once, in_order
 from diffrigid.contact.resting import Strikes, are_alone
 from diffrigid.contact.sides import (
     Side,
@@ -43,7 +43,7 @@ from diffrigid.joints import Weld
 from diffrigid.linkage import ends_of
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import replace
-from diffrigid.shapes import Disc, HalfSpace, HeightField, Profile, Sphere
+from diffrigid.shapes import Capsule, Disc, HalfSpace, HeightField, Profile, Sphere
 from diffrigid.state import rotations
 
 if TYPE_CHECKING:
@@ -70,9 +70,10 @@ def find_strikes(
         start += rows
     meets = jax.vmap(lambda a, b, rested: next_meeting(world, a, b, dt, rested.any(0), at_end, width))
     meetings = [meets(*sides, own) for sides, own in zip(groups, rested, strict=True)]
+    a, b = pair_ends(world)
+    meetings = at_once(meetings, a, b)
     if stops_of(world):
         meetings.append(meet_stops(world, flight, since, dt, at_end))
-    a, b = pair_ends(world)
     bounces = _coefficients(world, "restitution", a, b, dt.shape) > 0 if waits(world) else None
     a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
     links = Links(a, b, islands(ends_of(world.joints), len(world.names)))
@@ -106,9 +107,9 @@ def waits(world: "World") -> bool:
     That is so beside friction or motors of joints, and with loads where a body may touch several others, or one of
     them at several points.
     """
-    column, drives = ends(world), driven(world)
-    pairs = tuple(dict.fromkeys(zip(column["a"], column["b"], strict=True)))
-    a, b = zip(*pairs, strict=True)
+    drives = driven(world)
+    joined = tuple(dict.fromkeys(zip(stop_ends(world, "a"), stop_ends(world, "b"), strict=True)))
+    a, b = zip(*zip(*pair_ends(world), strict=True), *joined, strict=True)
     alone = are_alone(a, b, len(world.names)) and all(pairs.count == 1 for pairs in world.pairs)
     return not all(drives) and (any(drives) or (is_loaded(world) and not alone))
 
@@ -117,12 +118,16 @@ def is_loaded(world: "World") -> bool:
     """Whether resting contacts may carry a load. Static.
 
     They do by forces and joints, and without both by rotation: a side that turns presses what slips along it, or lies
-    on it. Round bodies have no sides, and corners on a half-space swing away from it.
+    on it. Round bodies have no sides, and corners on a half-space swing away from it; a round end off the centre of
+    mass may swing towards it.
     """
 
     def turns_a_side(pairs: PairGroup) -> bool:
-        kinds = type(world.shapes[pairs.shape_a]), type(world.shapes[pairs.shape_b])
-        return kinds[1] is not HalfSpace and not all(issubclass(kind, Disc | Sphere) for kind in kinds)
+        groups = pairs.shape_a, pairs.shape_b
+        shapes = [world.shapes[group] for group in groups]
+        if any(isinstance(world.shapes[g], Disc | Sphere | Capsule) and world.offsets[g] is not None for g in groups):
+            return True
+        return not isinstance(shapes[1], HalfSpace) and not all(isinstance(shape, Disc | Sphere) for shape in shapes)
 
     return bool(world.forces or world.joints) or any(map(turns_a_side, world.pairs))
 

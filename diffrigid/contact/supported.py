@@ -42,7 +42,7 @@ def find_supported(world: "World", flight: Flight, since: Array, dt: Array) -> A
 def _rests(a: Side, b: Side, t1: Array, straight: bool, rest_speed: Array) -> Array:
     """Whether two colliders rest on each other where their paths begin, (*batch) bool."""
     a, b, t1, rest_speed = lax.stop_gradient((a, b, t1, rest_speed))
-    if closed_form(a.shape, b.shape, straight):
+    if closed_form(a, b, straight):
         return round_rests(a, b, earliest(a, b)[0], rest_speed)
     task = task_of(a, b, t1, None, rest_speed, jnp.zeros(t1.shape, bool))
     return resting(task, gaps_at(a, b, task.start, opaque_true(t1))).any(0)

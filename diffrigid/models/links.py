@@ -1,7 +1,7 @@
 """Links as in files of robots, and the scene made of them.
 
 A link has a frame of its own; mass, shapes and the joint to its parent are given in it. A `Body` has its origin at its
-centre of mass, and the axes of its shape.
+centre of mass, and the axes of its only shape, or those of the link.
 """
 
 import warnings
@@ -14,6 +14,7 @@ import numpy as np
 from diffrigid import joints
 from diffrigid.contact import Contact
 from diffrigid.models.frames import Frame, to_quaternion
+from diffrigid.parts import Part
 from diffrigid.scene import RESERVED, Body, Static, scene
 from diffrigid.shapes import HalfSpace
 from diffrigid.state import State
@@ -103,7 +104,7 @@ def assemble(
     """
     skipped = list(left_out)
     bodies: dict[str, Any] = {}
-    shapes: dict[str, tuple[str, Geometry]] = {}  # of each collider: its link and its shape
+    shapes: dict[str, tuple[str, list[Geometry]]] = {}  # of each collider: its link and its shapes
     frames: dict[str, Frame] = {}
     for link in links:
         if link.still:
@@ -114,11 +115,10 @@ def assemble(
                 bodies[geometry.name] = Static(
                     geometry.shape, x=placed.x, q=to_quaternion(placed.R), friction=geometry.friction
                 )
-                shapes[geometry.name] = link.name, geometry
+                shapes[geometry.name] = link.name, [geometry]
         else:
             bodies[link.name], frames[link.name], chosen = _body(where, link, skipped)
-            if chosen is not None:
-                shapes[link.name] = link.name, chosen
+            shapes[link.name] = link.name, chosen
     made: dict[str, Any] = {}
     for link in links:
         if not link.still and link.joint.kind != "free":
@@ -141,30 +141,47 @@ def free_name(name: str, taken: Any, suffix: str) -> str:
     return name
 
 
-def _body(where: str, link: Link, skipped: list[str]) -> tuple[Body, Frame, Geometry | None]:
-    """Make a body of a moving link; return its axes in the world, and the shape that it collides with, too."""
+def _body(where: str, link: Link, skipped: list[str]) -> tuple[Body, Frame, list[Geometry]]:
+    """Make a body of a moving link; return its axes in the world, and the shapes that it collides with, too."""
     if link.mass is None or not link.mass.mass > 0:
         raise ValueError(f"{where}: {link.name!r} moves and has no mass: give it an inertial, or fix it.")
-    mass, chosen = link.mass, None
+    mass, chosen = link.mass, []
     for geometry in link.geometry:
-        if geometry.shape is None or not any(geometry.bits):
-            continue
-        size = max(float(np.linalg.norm(geometry.frame.x)), float(np.sqrt(np.trace(mass.inertia) / mass.mass)))
         if isinstance(geometry.shape, HalfSpace):
             skipped.append(f"{geometry.name}, a plane that moves")
-        elif np.linalg.norm(geometry.frame.x - mass.center) > CENTRED * size:
-            skipped.append(f"{geometry.name}, which is off the centre of mass of {link.name} and does not collide here")
-        elif chosen is not None:
-            skipped.append(f"{geometry.name}, the second shape of {link.name}")
-        else:
-            chosen = geometry
-    R = np.eye(3) if chosen is None else chosen.frame.R
+        elif geometry.shape is not None and any(geometry.bits):
+            chosen.append(geometry)
+    if len({geometry.friction for geometry in chosen}) > 1:
+        skipped.append(f"the friction of all shapes of {link.name} but {chosen[0].name}")
+    R, shape, center = np.eye(3), None, None
+    if len(chosen) == 1 and _is_centred(chosen[0], mass):
+        R, shape = chosen[0].frame.R, chosen[0].shape
+    elif chosen:
+        shape, center = _parts(chosen), mass.center
     axes = link.frame @ Frame(mass.center, R)
     body = Body(
-        None if chosen is None else chosen.shape, mass=mass.mass, inertia=turned(mass.inertia, R.T), x=axes.x,
-        q=to_quaternion(axes.R), friction=None if chosen is None else chosen.friction,
+        shape, mass=mass.mass, inertia=turned(mass.inertia, R.T), center=center, x=axes.x, q=to_quaternion(axes.R),
+        friction=chosen[0].friction if chosen else None,
     )  # fmt: skip
     return body, axes, chosen
+
+
+def _is_centred(geometry: Geometry, mass: Mass) -> bool:
+    """Whether the origin of a shape is the centre of mass."""
+    size = max(float(np.linalg.norm(geometry.frame.x)), float(np.sqrt(np.trace(mass.inertia) / mass.mass)))
+    return float(np.linalg.norm(geometry.frame.x - mass.center)) <= CENTRED * size
+
+
+def _parts(chosen: Sequence[Geometry]) -> dict[str, Part]:
+    """The shapes of a link by name, in the axes of the link."""
+    parts: dict[str, Part] = {}
+    for geometry in chosen:
+        name = geometry.name.replace(".", "_")
+        while not name or name in parts:
+            name += "_shape"
+        q = None if np.array_equal(geometry.frame.R, np.eye(3)) else to_quaternion(geometry.frame.R)
+        parts[name] = Part(geometry.shape, x=geometry.frame.x, q=q)
+    return parts
 
 
 def _joint(link: Link, frames: dict[str, Frame], skipped: list[str]) -> Any:
@@ -193,13 +210,13 @@ def _are_told_apart(lower: float | None = None, upper: float | None = None) -> b
     return abs(joints.middle_of(lower, upper)) < np.pi and not 2 * np.pi <= spans < np.inf
 
 
-def _ignored(shapes: dict[str, tuple[str, Geometry]], apart: set[frozenset[str]]) -> list[tuple[str, str]]:
+def _ignored(shapes: dict[str, tuple[str, list[Geometry]]], apart: set[frozenset[str]]) -> list[tuple[str, str]]:
     """Pairs of colliders that pass through each other."""
     names, out = list(shapes), []
     for i, first in enumerate(names):
         for second in names[:i]:
             (link_a, a), (link_b, b) = shapes[first], shapes[second]
-            meet = a.bits[0] & b.bits[1] or b.bits[0] & a.bits[1]
+            meet = any(one.bits[0] & two.bits[1] or two.bits[0] & one.bits[1] for one in a for two in b)
             if not meet or frozenset((link_a, link_b)) in apart:
                 out.append((first, second))
     return out

@@ -66,8 +66,8 @@ def load_mjcf(path: str | Path, *, restitution: Any = 0.0, contact: Contact | No
         ValueError: names the element and the attribute that cannot be read.
 
     Warns:
-        UserWarning: names all that is left out: meshes, cylinders and ellipsoids do not collide, a body collides with
-            one geom that is centred at its centre of mass; actuators, tendons, springs of joints, armature.
+        UserWarning: names all that is left out: meshes, cylinders and ellipsoids do not collide, the geoms of a body
+            have one friction; actuators, tendons, springs of joints, armature.
 
     Example:
         >>> text = '''<mujoco><worldbody><geom name="ground" type="plane" size="1 1 1" friction="0.6"/><body name="ball"

@@ -38,7 +38,7 @@ def load_urdf(
         ValueError: names the element and the attribute that cannot be read, links in a loop or without a mass.
 
     Warns:
-        UserWarning: names all that is left out: meshes and cylinders do not collide, nor shapes off the centre of mass.
+        UserWarning: names all that is left out: meshes and cylinders do not collide.
 
     Example:
         >>> text = '''<robot name="r"><link name="rod"><inertial><mass value="2"/><origin xyz="0 0 -0.5"/>

@@ -23,7 +23,7 @@ from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.problem import full_turn
 from diffrigid.sysid.records import Run
 from diffrigid.sysid.setup import Problem
-from diffrigid.world import World
+from diffrigid.world import World, seats
 
 AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are autocorrelated, mean that the fit failed
 ANYWHERE = 0.25  # [-] of a turn: residuals of uniformly random angles are 1 / sqrt(12) of a turn
@@ -192,6 +192,7 @@ def _light_inertia(problem: Problem, scene: Scene) -> list[str]:
 
 def _is_turned(world: World, body: int) -> bool:
     """Whether anything can turn a body: friction, joints, torques of forces, or a shape that is not round."""
-    (shape,) = (shape for shape, owners in zip(world.shapes, world.owners, strict=True) if body in owners)
+    shapes = [(world.shapes[seat.group], world.offsets[seat.group]) for seat in seats(world) if seat.owner == body]
+    is_round = all(isinstance(shape, Disc | Sphere) and offset is None for shape, offset in shapes)
     rubs = bool((np.asarray(world.bodies.friction) > 0).any() or (np.asarray(world.statics.friction) > 0).any())
-    return rubs or bool(world.joints) or has_torque(world) or not isinstance(shape, Disc | Sphere)
+    return rubs or bool(world.joints) or has_torque(world) or not is_round

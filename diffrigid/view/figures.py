@@ -4,7 +4,7 @@ view.strobe(trajectory).figure.savefig("motion.pdf")
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,9 +15,7 @@ from diffrigid.touch import rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.view.frames import energies, turns
 from diffrigid.view.outline import outline
-
-if TYPE_CHECKING:
-    from diffrigid.world import World
+from diffrigid.world import World, seated, seats
 
 
 def strobe(trajectory: Trajectory, pictures: int = 10, ax: Any = None) -> Any:
@@ -120,19 +118,18 @@ def _poses(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(trajectory.state.x, float), np.asarray(trajectory.state.q, float)
 
 
-def _outlines(world: "World", colliders: range, reach: float = 0.0) -> list[tuple[int, np.ndarray]]:
+def _outlines(world: World, colliders: range, reach: float = 0.0) -> list[tuple[int, np.ndarray]]:
     """Collider and closed outline (P, 2) [m], about its centre, of every shape of these colliders."""
     found = []
-    for group, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
-        for row, owner in enumerate(owners):
-            if owner not in colliders:
-                continue
-            lines = outline(jax.tree.map(lambda leaf, row=row: np.asarray(leaf)[row], group), 2, reach=reach)
-            found.append((owner, lines if offset is None else lines + np.asarray(offset.r[row])))
+    for seat in (seat for seat in seats(world) if seat.owner in colliders):
+        shape, r, q = jax.tree.map(np.asarray, seated(world, seat))
+        lines = outline(shape, 2, reach=reach)
+        lines = lines if q is None else rotated(q, lines)
+        found.append((seat.owner, lines if r is None else lines + r))
     return found
 
 
-def _stage(ax: Any, world: "World", x: np.ndarray, shapes: list) -> None:
+def _stage(ax: Any, world: World, x: np.ndarray, shapes: list) -> None:
     """Draw the statics, and set limits that contain the whole motion of bodies with these outlines."""
     pad = max((1.1 * float(np.linalg.norm(lines, axis=1).max()) for _, lines in shapes), default=0.0)
     low, high = np.nanmin(x, axis=(0, 1)) - pad, np.nanmax(x, axis=(0, 1)) + pad

@@ -103,16 +103,17 @@ function makeView(canvas, scene, redraw) {
 
   // Path of a shape on a body at pose {x, q}; true if it is closed.
   function trace({ pen, at, scale }, shape, { x: [x, y], q: [angle] }) {
-    const c = Math.cos(angle), s = Math.sin(angle), place = ([u, v]) => at([x + c * u - s * v, y + s * u + c * v]);
-    const [ox, oy] = shape.at, r = shape.radius * scale;
+    const turned = (by, [u, v]) => [Math.cos(by) * u - Math.sin(by) * v, Math.sin(by) * u + Math.cos(by) * v];
+    const [ox, oy] = turned(angle, shape.at), whole = angle + (shape.turn ? Math.atan2(shape.turn[1], shape.turn[0]) : 0);
+    const place = (point) => { const [u, v] = turned(whole, point); return at([x + ox + u, y + oy + v]); }, r = shape.radius * scale;
     pen.beginPath();
-    if (shape.kind === "ball") pen.arc(...place([ox, oy]), r, 0, 7);
+    if (shape.kind === "ball") pen.arc(...place([0, 0]), r, 0, 7);
     else if (shape.kind === "capsule") {
-      pen.arc(...place([ox + shape.half, oy]), Math.max(r, 0.75), -angle - Math.PI / 2, -angle + Math.PI / 2);
-      pen.arc(...place([ox - shape.half, oy]), Math.max(r, 0.75), -angle + Math.PI / 2, -angle + 1.5 * Math.PI);
+      pen.arc(...place([shape.half, 0]), Math.max(r, 0.75), -whole - Math.PI / 2, -whole + Math.PI / 2);
+      pen.arc(...place([-shape.half, 0]), Math.max(r, 0.75), -whole + Math.PI / 2, -whole + 1.5 * Math.PI);
     } else {
       const [a, b] = shape.half ?? [], points = shape.points ?? [[-a, -b], [a, -b], [a, b], [-a, b]];
-      points.forEach(([u, v], k) => (k ? pen.lineTo(...place([ox + u, oy + v])) : pen.moveTo(...place([ox + u, oy + v]))));
+      points.forEach((point, k) => (k ? pen.lineTo(...place(point)) : pen.moveTo(...place(point))));
     }
     pen.closePath();
     return place;
@@ -185,7 +186,7 @@ function makeView(canvas, scene, redraw) {
       pen.globalAlpha = scene.overlaid ? 0.18 : 0.32; pen.fill(); pen.globalAlpha = 1; pen.stroke();
       const size = (shape.radius ?? Math.min(...(shape.half ?? [Infinity]))) * scale;
       if (shape.kind === "ball" && size > 4) { // a spoke shows the turn
-        pen.beginPath(); pen.moveTo(...place(shape.at)); pen.lineTo(...place([shape.at[0] + shape.radius, shape.at[1]])); pen.stroke();
+        pen.beginPath(); pen.moveTo(...place([0, 0])); pen.lineTo(...place([shape.radius, 0])); pen.stroke();
       }
     }
     for (const body of bare) { pen.fillStyle = scene.of(run, body); pen.beginPath(); pen.arc(...at(poses[body].x), 4, 0, 7); pen.fill(); }

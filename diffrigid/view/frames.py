@@ -21,7 +21,7 @@ from diffrigid.sysid.sensors import Part
 from diffrigid.touch import rotated
 from diffrigid.trajectory import Trajectory
 from diffrigid.view.outline import nodes
-from diffrigid.world import World
+from diffrigid.world import World, seated, seats
 
 LEVELS = 65534  # of a packed number; 65535 is NaN
 
@@ -104,13 +104,13 @@ def _near(q: np.ndarray) -> np.ndarray:
 
 
 def shapes(world: World) -> list[dict[str, Any]]:
-    """Kind, collider and dimensions of every shape, and where its origin sits on the body."""
+    """Kind, collider and dimensions of every shape, and where and how turned it sits on the body."""
     found = []
-    for group, offset, owners in zip(world.shapes, world.offsets, world.owners, strict=True):
-        for row, owner in enumerate(owners):
-            shape = jax.tree.map(lambda leaf, row=row: leaf[row], group)
-            at = [0.0] * world.dim if offset is None else _short(offset.r[row])
-            found.append({"body": owner, "at": at} | _kind(shape))
+    for seat in seats(world):
+        shape, r, q = seated(world, seat)
+        at = [0.0] * world.dim if r is None else _short(r)
+        turn = {} if q is None else {"turn": _short(q)}
+        found.append({"body": seat.owner, "at": at} | turn | _kind(shape))
     return found
 
 

@@ -62,6 +62,7 @@ function makeView(canvas, scene, redraw) {
     if (shape.kind === "ball") group.add(ballStripes(shape));
     else group.add(new THREE.LineSegments(new THREE.EdgesGeometry(form, 30), view.paint(new THREE.LineBasicMaterial(), clear ? "ghost" : "edge")));
     group.position.set(...shape.at);
+    if (shape.turn) group.quaternion.set(shape.turn[1], shape.turn[2], shape.turn[3], shape.turn[0]);
     const holder = new THREE.Group();
     holder.add(group);
     return holder;
