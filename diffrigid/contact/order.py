@@ -109,12 +109,12 @@ def at_once(meetings: list[Meeting], a: tuple[int, ...], b: tuple[int, ...]) -> 
     Args:
         meetings: of the pairs of shapes, between the colliders a and b (P,).
     """
-    members = alike(tuple(tuple(sorted(pair)) for pair in zip(a, b, strict=True)))
-    if len(members[0]) == 1:
+    both = tuple(tuple(sorted(pair)) for pair in zip(a, b, strict=True))
+    if len(set(both)) == len(both):
         return meetings
     s, fast, hit = (jnp.concatenate([getattr(m, name) for m in meetings]) for name in ("s", "fast", "hit"))
     impacts = jnp.where(fast, s, jnp.inf)
-    first = rows(jnp.concatenate([impacts, jnp.full_like(s[:1], jnp.inf)]), members).min(1)
+    first = rows(jnp.concatenate([impacts, jnp.full_like(s[:1], jnp.inf)]), alike(both)).min(1)
     strikes = first < jnp.inf
     s, fast, hit = jnp.where(strikes, first, s), fast | strikes, hit | strikes
     together, start = [], 0
