@@ -37,10 +37,9 @@ class Outline(NamedTuple):
         return np.linalg.norm(self.corners - self.corners.mean(0), axis=1).max() + self.rounding
 
 
-def place(shape: Any, x: np.ndarray, q: np.ndarray, center: np.ndarray) -> Outline:
-    """Outline of a shape whose point `center` is at x (D,) [m], with orientation q."""
+def place(shape: Any, x: np.ndarray, q: np.ndarray) -> Outline:
+    """Outline of a shape whose origin is at x (D,) [m], with orientation q."""
     dim = len(x)
-    x = x - rotated(q, np.asarray(center))
     if isinstance(shape, HalfSpace):
         normal = rotated(q, np.asarray(shape.normal))
         none = np.zeros((0, dim))
@@ -90,6 +89,16 @@ def _across(a: Outline, b: Outline) -> np.ndarray:
 
 def warn_of_overlap(world: World, state: State) -> None:
     """Warn of pairs that penetrate at the start, except those with uneven ground or a traced value."""
+    placed = outlines(world, state)
+    if deep := overlapping(placed, near_pairs(placed, len(world.names)) if world.crowd else pairs_of(world)):
+        names = world.names + world.static_names
+        both = sorted({(min(i[0], j[0]), max(i[0], j[0])) for i, j in deep})
+        text = ", ".join(f"{names[i]} and {names[j]}" for i, j in both)
+        warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore.", stacklevel=3)
+
+
+def outlines(world: World, state: State) -> dict[tuple[int, int, int], Outline]:
+    """Outlines by owner, group and row, except those of uneven ground or with a traced value."""
     poses = [*zip(state.x, state.q, strict=True), *zip(world.statics.x, world.statics.q, strict=True)]
     placed = {}
     for seat in seats(world):
@@ -98,16 +107,18 @@ def warn_of_overlap(world: World, state: State) -> None:
         if not isinstance(shape, UNEVEN) and not traced((shape, r, turn, x, q)):
             x = x if r is None else x + rotated(q, r)
             q = q if turn is None else known(rotations(world.dim).compose, q, turn)
-            placed[seat.owner, seat.group, seat.row] = place(shape, x, q, np.zeros(world.dim))
-    pairs: list = near_pairs(placed, len(world.names)) if world.crowd else []
+            placed[seat.owner, seat.group, seat.row] = place(shape, x, q)
+    return placed
+
+
+def pairs_of(world: World) -> list[tuple[tuple[int, int, int], tuple[int, int, int]]]:
+    """All pairs of shapes that can meet, as keys of `outlines`."""
+    found: list = []
     for group in world.pairs:
-        sides = ((group.a, group.shape_a, group.row_a), (group.b, group.shape_b, group.row_b))
-        pairs += zip(*(zip(on, [kind] * len(on), row, strict=True) for on, kind, row in sides), strict=True)
-    if deep := overlapping(placed, pairs):
-        names = world.names + world.static_names
-        both = sorted({(min(i[0], j[0]), max(i[0], j[0])) for i, j in deep})
-        text = ", ".join(f"{names[i]} and {names[j]}" for i, j in both)
-        warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore.", stacklevel=3)
+        kinds = (group.a, group.shape_a, group.row_a), (group.b, group.shape_b, group.row_b)
+        sides = ([(owner, kind, row) for owner, row in zip(owners, rows, strict=True)] for owners, kind, rows in kinds)
+        found += zip(*sides, strict=True)
+    return found
 
 
 def overlapping(colliders: dict[tuple, Outline], pairs: list) -> list[tuple[tuple, tuple]]:

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 
 STEPS, BATCH = 24, 128
-STRUCTURES = ("round2", "free2", "yard2", "round3", "hull3", "boxes3", "chain2", "arm3", "crowd2")
+STRUCTURES = ("round2", "free2", "yard2", "round3", "hull3", "boxes3", "chain2", "arm3", "crowd2", "parts2")
 PENTAGON = tuple(2.0 * 3.141592653589793 * i / 5 for i in range(5))
 OCTAHEDRON = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 KINDS = {  # shapes in the order in which they stand in a line; a capital is a static. Few: compiling takes the time
@@ -32,9 +32,10 @@ KINDS = {  # shapes in the order in which they stand in a line; a capital is a s
     "chain2": ("box", "box", "disc", "disc"),
     "arm3": ("sphere", "sphere", "sphere"),
     "crowd2": ("disc",) * 8,
+    "parts2": ("hammer", "disc"),
 }
 LINKED, SECOND_ORDER = ("chain2", "arm3"), 1e-5  # what limits and friction leave of angular momentum, relative
-FLOOR = ("yard2", "hull3", "arm3", "crowd2")
+FLOOR = ("yard2", "hull3", "arm3", "crowd2", "parts2")
 
 
 def draw(structure, batch):
@@ -94,6 +95,9 @@ def shape_of(kind, p, i, dim):
             return dr.Box(half=half)
         case "capsule":
             return dr.Capsule(radius=half[1], half_length=size)
+        case "hammer":
+            head = dr.Part(dr.Disc(radius=0.5 * half[1]), x=half * jnp.asarray((1.0, 0.0), half.dtype))
+            return {"handle": dr.Part(dr.Box(half=half), angle=p["jitter"][i, 0, 0]), "head": head}
         case "polygon":
             angle = jnp.asarray(PENTAGON, size.dtype) + 3.0 * p["jitter"][i, :5, 0]
             return dr.Polygon(vertices=half * jnp.stack([jnp.cos(angle), jnp.sin(angle)], 1))
@@ -115,9 +119,13 @@ def build(structure, p):
     bodies, top = {}, jnp.zeros((), dtype)
     for i, kind in enumerate(kinds):
         shape, q = shape_of(kind, p, i, dim), p["q"][i]
-        corners = vertices(shape, dim) - volume_properties(shape, dim)[1]
-        corners = jnp.stack([so.rotate(q, corner) for corner in corners])
-        low, high = corners.min(0) - radius(shape), corners.max(0) + radius(shape)
+        if kind == "hammer":
+            high = jnp.full(dim, 4.0 * p["size"][i])  # more than enough
+            low = -high
+        else:
+            corners = vertices(shape, dim) - volume_properties(shape, dim)[1]
+            corners = jnp.stack([so.rotate(q, corner) for corner in corners])
+            low, high = corners.min(0) - radius(shape), corners.max(0) + radius(shape)
         upright = p["upright"]
         low_d, high_d = (jnp.where(upright, side[-1], side[0]) for side in (low, high))
         place = top - low_d + p["slack"][i]
@@ -189,23 +197,12 @@ def depth(world, state, index):
     import jax
     import numpy as np
 
-    from diffrigid.overlap import place, separation
+    from diffrigid.overlap import outlines, pairs_of, separation
 
-    world = jax.tree.map(lambda leaf: np.asarray(leaf[index], float), world)
-    n, placed = len(world.names), {}
-    for kind, owners in enumerate(world.owners):
-        for row, owner in enumerate(owners):
-            shape = jax.tree.map(lambda leaf: leaf[row], world.shapes[kind])  # noqa: B023
-            still = owner - n
-            x, q = (state.x[owner], state.q[owner]) if still < 0 else (world.statics.x[still], world.statics.q[still])
-            offset = world.offsets[kind]
-            center = np.zeros(world.dim) if offset is None else -offset.r[row]
-            placed[owner] = place(shape, np.asarray(x, float), np.asarray(q, float), center)
-    worst = 0.0
-    for group in world.pairs:
-        for i, j in zip(group.a, group.b, strict=True):
-            size = min(placed[i].size, placed[j].size)
-            worst = max(worst, -separation(placed[i], placed[j]) / size)
+    world, state = jax.tree.map(lambda leaf: np.asarray(leaf, float), (jax.tree.map(lambda l: l[index], world), state))
+    placed, worst = outlines(world, state), 0.0
+    for i, j in pairs_of(world):
+        worst = max(worst, -separation(placed[i], placed[j]) / min(placed[i].size, placed[j].size))
     return worst
 
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import diffrigid as dr
 from diffrigid import so3
 from diffrigid.collide import COLLIDERS, CONVEX_2D, CONVEX_3D
-from diffrigid.overlap import place, separation
+from diffrigid.overlap import outlines, place, separation
 from diffrigid.shapes import with_topology
 from diffrigid.state import rotations
 
@@ -69,8 +69,7 @@ def so_rotate(dim, q, r):
 
 
 def distance(dim, a, x_a, q_a, b, q_b):
-    origin = np.zeros(dim)
-    return separation(place(a, x_a, q_a, origin), place(b, np.zeros(dim), q_b, origin))
+    return separation(place(a, x_a, q_a), place(b, np.zeros(dim), q_b))
 
 
 @pytest.mark.parametrize(("dim", "kind_a", "kind_b"), PAIRS, ids=lambda p: getattr(p, "__name__", f"{p}D"))
@@ -98,8 +97,8 @@ def test_pair(dim, kind_a, kind_b):
         assert_allclose(touching, 0.0, atol=ROUNDING if expected[k] > 0 else 1e-5)
         if expected[k] < 0:
             continue  # near an edge the point inside may be closer to another face
-        speck = place(dr.Disc(radius=0.0) if dim == 2 else dr.Sphere(radius=0.0), point[k], q_a[k], np.zeros(dim))
-        assert_allclose(separation(speck, place(b, x_b[k], q_b[k], np.zeros(dim))), 0.5 * gap[k], atol=1e-7)
+        speck = place(dr.Disc(radius=0.0) if dim == 2 else dr.Sphere(radius=0.0), point[k], q_a[k])
+        assert_allclose(separation(speck, place(b, x_b[k], q_b[k])), 0.5 * gap[k], atol=1e-7)
 
 
 @pytest.mark.parametrize(("dim", "kind"), [(dim, kind) for dim in SHAPES for kind in SHAPES[dim]])
@@ -156,18 +155,12 @@ def test_the_gap_of_two_bodies_is_their_distance_wherever_the_shape_sits(names):
     }
     world, state = dr.scene(bodies)
 
-    def of(name):
-        shape, centre = bodies[name].shape, np.zeros(2)
-        if name in world.names:
-            k = world.names.index(name)
-            (offset,) = (o for o, owners in zip(world.offsets, world.owners, strict=True) if k in owners)
-            centre = centre if offset is None else -np.asarray(offset.r[0])
-            return place(shape, np.asarray(state.x[k]), np.asarray(state.q[k]), centre)
-        k = world.static_names.index(name)
-        return place(shape, np.asarray(world.statics.x[k]), np.asarray(world.statics.q[k]), centre)
-
+    placed = {
+        list(bodies)[owner]: outline
+        for (owner, *_), outline in outlines(*jax.tree.map(np.asarray, (world, state))).items()
+    }
     found, slope = jax.jit(jax.value_and_grad(lambda state: dr.gap(world, state, *names)))(state)
-    assert_allclose(found, separation(of(names[0]), of(names[1])), atol=ROUNDING)
+    assert_allclose(found, separation(placed[names[0]], placed[names[1]]), atol=ROUNDING)
     assert_allclose(dr.gap(world, state, *names[::-1]), found, atol=ROUNDING)
     moves = np.linalg.norm(np.asarray(slope.x), axis=1)  # by one along the normal
     assert_allclose(moves[[world.names.index(name) for name in names if name in world.names]], 1.0, atol=1e-9)
@@ -201,7 +194,7 @@ def test_a_gap_that_is_not_there_is_refused():
         (("ball", "hill"), "is a Profile, to which there is no distance"),
         (("ball", "flor"), "did you mean 'floor'"),
         (("ball", "dot"), "no shape"),
-        (("floor", "wall"), "neither"),
+        (("floor", "wall"), "are half-spaces, which have no distance"),
         (("ball", "ball"), "twice"),
     ):
         with pytest.raises(ValueError, match=f"gap: .*{why}"):

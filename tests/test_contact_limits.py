@@ -403,8 +403,8 @@ def test_an_edge_that_rests_hides_no_impact_of_another():
     body = dr.Body(box, mass=1.0, inertia=(0.01, 0.012, 0.014), **start)
     world, state = dr.scene({"box": body, "block": dr.Static(block)}, gravity=(0.0, 0.0, -G))
     end = dr.step(world, state, 1 / 480)
-    x, q, none = np.asarray(end.x[0]), np.asarray(end.q[0]), np.zeros(3)
-    apart = separation(place(box, x, q, none), place(block, none, np.array([1.0, 0.0, 0.0, 0.0]), none))
+    x, q = np.asarray(end.x[0]), np.asarray(end.q[0])
+    apart = separation(place(box, x, q), place(block, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])))
     assert apart > -1e-6  # 0.5 mm where the second is taken for the first
 
 

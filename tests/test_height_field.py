@@ -40,7 +40,7 @@ def prisms():
         for cell in (((0, 0), (1, 0), (1, 1)), ((0, 0), (1, 1), (0, 1))):
             top = np.array([(0.5 * (i + k - 3), 0.5 * (j + l - 3), wide[i + k, j + l]) for k, l in cell])
             solid = dr.Hull(vertices=np.concatenate([top, top * (1, 1, 0) - (0, 0, 2)]))
-            yield top, place(with_topology(solid), np.zeros(3), np.array(UNTURNED), np.zeros(3))
+            yield top, place(with_topology(solid), np.zeros(3), np.array(UNTURNED))
 
 
 @functools.cache
@@ -66,7 +66,7 @@ def test_distance_is_that_of_the_nearest_part_of_the_solid(kind):
     for x in rng.uniform((-0.6, -0.6, 0.3), (4.6, 4.1, 0.8), (60, 3)):
         q = rng.normal(size=4)
         q /= np.linalg.norm(q)
-        body = place(with_topology(SHAPES[kind]), x, q, np.zeros(3))
+        body = place(with_topology(SHAPES[kind]), x, q)
         near = [solid for top, solid in parts() if np.linalg.norm(top[:, :2].mean(0) - x[:2]) < 1.8]
         wanted = min(separation(body, solid) for solid in near)
         if wanted > 1e-3:
