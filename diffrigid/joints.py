@@ -63,6 +63,7 @@ class Revolute:
     friction: Leaf = array(default=None)  # (*batch) [N m]
     speed: Leaf = array(default=None)  # (*batch) [rad/s] of the motor; None: 0
     damping: Leaf = array(default=None)  # (*batch) [N m s/rad]
+    period = 2.0 * jnp.pi  # [rad] after which the coordinate is the same again
 
     def __call__(self, so: ModuleType, a: Pose, b: Pose) -> Array:
         apart = separation(self, so, a, b)
@@ -163,6 +164,7 @@ class Prismatic:
     friction: Leaf = array(default=None)  # (*batch) [N]
     speed: Leaf = array(default=None)  # (*batch) [m/s] of the motor; None: 0
     damping: Leaf = array(default=None)  # (*batch) [N s/m]
+    period = None
 
     def __call__(self, so: ModuleType, a: Pose, b: Pose) -> Array:
         apart = separation(self, so, a, b)
@@ -215,4 +217,4 @@ def places(joint: Any, a: Pose, b: Pose) -> Array:
 
 def _turn(joint: Any, so: ModuleType, a: Pose, b: Pose) -> Array:
     """Rotation of a from its nominal orientation in b, (A, *batch) [rad], to first order."""
-    return so.sine(so.difference(joint.q, so.difference(b.q, a.q)))
+    return so.chord(so.difference(joint.q, so.difference(b.q, a.q)))

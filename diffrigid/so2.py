@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.numerics import components, cos_sin, dot
+from diffrigid.numerics import components, cos_sin, dot, normalise, unit_vector
 
 D, A, Q = 2, 1, 2  # components of a vector, of an angular velocity, of an orientation
 
@@ -143,9 +143,10 @@ def difference(q: Array, p: Array) -> Array:
     return unrotate(q, p)
 
 
-def sine(q: Array) -> Array:
-    """Sine of the angle of q, (1, *batch): the angle itself to first order."""
-    return q[1:]
+def chord(q: Array) -> Array:
+    """Twice the sine of half the angle of q, (1, *batch): the angle to first order, and zero for no other turn."""
+    half = normalise(q + unit_vector(q, 0), fallback=unit_vector(q, 1))
+    return 2.0 * half[1:]
 
 
 def gyroscopic(inertia: Array, q: Array, w: Array) -> Array:

@@ -345,9 +345,10 @@ def difference(q: Array, p: Array) -> Array:
     return _unit_product([s, -x, -y, -z], p)
 
 
-def sine(q: Array) -> Array:
-    """Axis of q times the sine of its angle, (3, *batch): the rotation vector to first order."""
-    return 2.0 * q[:1] * q[1:]
+def chord(q: Array) -> Array:
+    """Axis of q times twice the sine of half its angle, (3, *batch): the rotation vector to first order, and zero for
+    no other turn."""
+    return jnp.where(q[:1] < 0, -2.0, 2.0) * q[1:]
 
 
 def gyroscopic(inertia: Array, q: Array, w: Array) -> Array:

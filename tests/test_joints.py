@@ -272,6 +272,7 @@ MISTAKES = {
     "statics": (r"revolute joins 'wall' to 'post': expected one that moves", dr.Revolute("wall", "post", anchor_a=(0.0, 0.0))),
     "world first": (r"revolute.a is None: expected a body; name it first", dr.Revolute(None, "arm", anchor_a=(0.0, 0.0))),
     "itself": (r"joins 'arm' to itself", dr.Revolute("arm", "arm", anchor_a=(0.0, 0.0))),
+    "half a turn off": ("weld does not hold at the start: it is off by 2 ", dr.Weld("arm", q=(-1.0, 0.0))),
     "apart": (r"revolute does not hold at the start: it is off by 0\.5 .*move a body", dr.Revolute("arm", anchor_a=(0.0, 0.0), anchor_b=(1.0, 0.5))),
     "axis": (r"prismatic\.axis_b has no length", dr.Prismatic("arm", axis_b=(0.0, 0.0))),
     "shape": (r"revolute\.anchor_a has shape \(3,\)", dr.Revolute("arm", anchor_a=(0.0, 0.0, 0.0))),

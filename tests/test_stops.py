@@ -269,12 +269,18 @@ def test_mistakes_are_named(along, message):
 
 @pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_limits_may_lie_beyond_half_a_turn(dim):
-    """Where the angle of an orientation jumps nothing happens, and what has one limit turns a long way from it."""
+    """Where the angle of an orientation jumps nothing happens, and what has one limit turns from it as long as it likes.
+
+    Limits that leave out hardly anything of a turn are struck all the same.
+    """
     both, one = {"lower": -0.5, "upper": 4.0, "restitution": 0.6}, {"upper": 0.5, "restitution": 0.6}
-    scene = wheels({"bounces": (4.5, both), "turns": (-4.5, one)}, dim)
-    bounced, gone = (turned(scene, 1.0, body)[0] for body in (0, 1))
+    nearly = {"lower": -3.14, "upper": 3.14, "restitution": 0.6}
+    made = {"bounces": (4.5, both), "turns": (-4.5, one), "nearly": (4.5, nearly), "goes on": (-12.0, one)}
+    bounced, gone, back, far = (turned(wheels(made, dim), 1.0, body)[0] for body in range(4))
     assert_allclose(bounced if dim == 2 else 2 * np.pi - bounced, 4.0 - 0.6 * 0.5, atol=EXACT)
     assert_allclose(jnp.abs(gone), 4.5 if dim == 2 else 2 * np.pi - 4.5, atol=EXACT)
+    assert_allclose(back, 3.14 - 0.6 * (4.5 - 3.14), atol=EXACT)
+    assert_allclose(jnp.abs(far), 12.0 if dim == 2 else 4 * np.pi - 12.0, atol=1e-7 if dim == 2 else 1e-6)
 
 
 def test_friction_of_a_slider_keeps_the_spin_of_its_rod():

@@ -207,7 +207,7 @@ def moving_along(side: Side, at: Placed, s: Array) -> Placed:
     so = rotations(f.dim)
 
     def path(s: Array) -> tuple[Array, Array]:
-        return position(f, s), so.sine(so.difference(at.q, orientation(f, s)))
+        return position(f, s), so.chord(so.difference(at.q, orientation(f, s)))
 
     v, w = jax.jvp(path, (s,), (jnp.ones_like(s),))[1]
     return replace(at, v=v, w=so.rotate(at.q, w) if so.D == 3 else w)

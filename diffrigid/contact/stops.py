@@ -101,11 +101,19 @@ def _rows_of(world: "World", stop: Stop, padded: Flight) -> tuple[Any, list[Flig
 
 
 def _gap(kind: str, joint: Any, a: Flight, b: Flight) -> Callable[[Array], Array]:
+    """Gap [m or rad] of a limit at any time of the paths; of a hinge continuous from where they begin, within pi."""
     so, sign = rotations(a.dim), -1.0 if kind == "upper" else 1.0
 
+    def coordinate(s: Array) -> Array:
+        return joint.coordinate(so, *(Pose(position(f, s), orientation(f, s)) for f in (a, b)))
+
+    first = None if joint.period is None else lax.stop_gradient(coordinate(jnp.maximum(a.t0, b.t0)))
+
     def gap(s: Array) -> Array:
-        poses = (Pose(position(f, s), orientation(f, s)) for f in (a, b))
-        return sign * (joint.coordinate(so, *poses) - getattr(joint, kind))
+        at = coordinate(s)
+        if first is not None:
+            at = at + joint.period * jnp.round((first - lax.stop_gradient(at)) / joint.period)
+        return sign * (at - getattr(joint, kind))
 
     return gap
 
@@ -136,14 +144,24 @@ def _struck(
         return low, high, jnp.where(within, newton, 0.5 * (low + high))
 
     found = lax.fori_loop(0, SEARCH, closer, (begin, end, 0.5 * (begin + end)))[2]
-    hit = inside & ~at_end
+    start = lax.stop_gradient(start)
+    passes = _passes(frozen_joint, *_rate(frozen, start), near)
+    hit = inside & ~at_end & ~passes
     s0 = checkpoint_name(lax.stop_gradient(jnp.where(hit & free, found, jnp.where(hit, start, dt))), FOUND)
     value, slope = _rate(gap, s0)
     slope = lax.stop_gradient(slope)
-    s = jnp.where(hit & free, implicit_root(s0, value, slope), jnp.where(hit, start, dt))
-    start = lax.stop_gradient(start)
-    rests = touches(*_rate(frozen, start), _second(frozen, start), near, rest_speed) & ~at_end
+    s = jnp.where(hit & free, implicit_root(s0, value, slope), jnp.where(hit, jnp.maximum(a.t0, b.t0), dt))
+    rests = touches(*_rate(frozen, start), _second(frozen, start), near, rest_speed) & ~at_end & ~passes
     return Meeting(s=s, hit=hit | at_end, fast=hit & (slope < -rest_speed), rests=rests[None])
+
+
+def _passes(joint: Any, gap: Array, rate: Array, near: Array) -> Array:
+    """Whether a limit with this gap and its rate is only passed on the way back, (*batch) bool.
+
+    A hinge with one limit that turns away from it comes to its other side, by a whole turn: nothing stops it there.
+    """
+    one_limit = joint.period is not None and (joint.lower is None or joint.upper is None)
+    return (gap < -near) & (rate > 0) if one_limit else jnp.zeros_like(gap, bool)
 
 
 def _rate(gap: Callable, s: Array) -> tuple[Array, Array]:
@@ -175,9 +193,11 @@ def _row(kind: str, dt: Array, joint: Any, a: Flight, b: Flight, meeting: Meetin
     start = jnp.maximum(a.t0, b.t0)
     if kind == "friction":  # mean acceleration since the paths begin
         open_by = begins_at = jnp.zeros_like(s)
+        passes = jnp.zeros_like(s, bool)
         pull = safe_divide(rate - _rate(gap, start)[1], s - start)
     else:
-        open_by, begins_at = gap(s), gap(start)
+        open_by, (begins_at, opens) = gap(s), _rate(gap, start)
+        passes = _passes(joint, begins_at, opens, _near(joint, a, b, start))
         pull = lax.stop_gradient(_second(gap, s))
     # Also a limit that has opened as its bodies fell away, or that was shut where their paths begin, and may have
     # rebounded: it may close again once they are held.
@@ -186,7 +206,7 @@ def _row(kind: str, dt: Array, joint: Any, a: Flight, b: Flight, meeting: Meetin
     near = open_by <= closed + dt**2 * jnp.abs((jac * jnp.stack(falls)).sum(1)).sum(0)
     near = near | (begins_at <= _near(joint, a, b, start))
     return Strikes(
-        active=meeting.hit & (~meeting.held | meeting.rests[0] | near), s=s, gap=open_by, rounding=closed,
+        active=meeting.hit & (~meeting.held | meeting.rests[0] | near) & ~passes, s=s, gap=open_by, rounding=closed,
         deepest=jnp.full_like(s, jnp.inf), normal=first, arm_a=none, arm_b=none,
         K=first[:, None] * first[None] * sum(mobile)[None, None], v_rel=rate[None] * first, press=-pull,
         pull=pull[None] * first, drift=none, rests=meeting.rests[0], now=meeting.now, held=meeting.held,
