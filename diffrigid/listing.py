@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jax import Array
 
-from diffrigid.paths import catalogue, leaf_of, unit
+from diffrigid.catalogue import catalogue, leaf_of, unit
 from diffrigid.shapes import traced
 from diffrigid.world import World, seats
 

@@ -9,6 +9,7 @@ import jax
 
 from diffrigid.convert import Numbers, Solid, known, numbers, orientation, positive, shape_of
 from diffrigid.moments import assembly_properties, volume_properties
+from diffrigid.pytree import Number, Vector
 from diffrigid.shape_checks import check_shape
 from diffrigid.shapes import BOUNDLESS, Shape, dimension, traced
 
@@ -34,10 +35,10 @@ class Part:
 
     shape: Shape
     _: KW_ONLY
-    x: Any = None
-    angle: Any = None
-    q: Any = None
-    mass: Any = None
+    x: Vector | None = None
+    angle: Number | None = None
+    q: Vector | None = None
+    mass: Number | None = None
 
 
 class Piece(NamedTuple):

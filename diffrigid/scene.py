@@ -13,8 +13,6 @@ from diffrigid.contact import Contact
 from diffrigid.contact.crowd import is_many
 from diffrigid.convert import (
     angular_velocity,
-    by_name,
-    force_of,
     mass_and_inertia,
     materials,
     nearest,
@@ -22,11 +20,12 @@ from diffrigid.convert import (
     orientation,
     stack,
 )
+from diffrigid.force_checks import by_name, force_of
 from diffrigid.forces import Gravity
 from diffrigid.joint_checks import joints_of, warn_of_torn_joints
 from diffrigid.overlap import warn_of_overlap
 from diffrigid.parts import Part, check_shapes, dimensions, pieces_of, solid_of
-from diffrigid.pytree import map_arrays, refuse_missing
+from diffrigid.pytree import Number, Vector, map_arrays, refuse_missing
 from diffrigid.shape_records import contact_count, looking_around, stack_shapes
 from diffrigid.shapes import BOUNDLESS, Shape, traced
 from diffrigid.state import COEFFICIENTS, Bodies, State, rotations
@@ -60,20 +59,20 @@ class Body:
 
     shape: Shape | Mapping[str, Part | Shape] | None
     _: KW_ONLY
-    mass: Any = None
-    density: Any = None
-    inertia: Any = None
-    center: Any = None
-    x: Any = None
-    v: Any = None
-    angle: Any = None
-    q: Any = None
-    w: Any = None
-    restitution: Any = None
-    friction: Any = None
-    restitution_falloff: Any = None
-    rolling_friction: Any = None
-    spinning_friction: Any = None
+    mass: Number | None = None
+    density: Number | None = None
+    inertia: Number | Vector | None = None
+    center: Vector | None = None
+    x: Vector | None = None
+    v: Vector | None = None
+    angle: Number | None = None
+    q: Vector | None = None
+    w: Number | Vector | None = None
+    restitution: Number | None = None
+    friction: Number | None = None
+    restitution_falloff: Number | None = None
+    rolling_friction: Number | None = None
+    spinning_friction: Number | None = None
 
 
 @dataclass(frozen=True)
@@ -89,28 +88,28 @@ class Static:
 
     shape: Shape
     _: KW_ONLY
-    x: Any = None
-    angle: Any = None
-    q: Any = None
-    restitution: Any = None
-    friction: Any = None
-    restitution_falloff: Any = None
-    rolling_friction: Any = None
-    spinning_friction: Any = None
+    x: Vector | None = None
+    angle: Number | None = None
+    q: Vector | None = None
+    restitution: Number | None = None
+    friction: Number | None = None
+    restitution_falloff: Number | None = None
+    rolling_friction: Number | None = None
+    spinning_friction: Number | None = None
 
 
 def scene(
     bodies: Mapping[str, Body | Static],
     *,
-    gravity: Any = None,
-    restitution: Any = 0.0,
-    friction: Any = 0.0,
-    restitution_falloff: Any = None,
-    rolling_friction: Any = None,
-    spinning_friction: Any = None,
+    gravity: Vector | None = None,
+    restitution: Number = 0.0,
+    friction: Number = 0.0,
+    restitution_falloff: Number | None = None,
+    rolling_friction: Number | None = None,
+    spinning_friction: Number | None = None,
     contact: Contact | None = None,
-    forces: Sequence | Mapping = (),
-    joints: Sequence | Mapping = (),
+    forces: Sequence[Any] | Mapping[str, Any] = (),
+    joints: Sequence[Any] | Mapping[str, Any] = (),
     ignore: Sequence[tuple[str, str]] = (),
 ) -> tuple[World, State]:
     """Make a world and its initial state from named bodies.

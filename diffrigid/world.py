@@ -106,7 +106,7 @@ def seated(world: World, seat: Seat) -> tuple[Any, Any, Any]:
 
 
 def check_kinds(world: Any, state: Any) -> None:
-    """Raise ValueError unless the arguments are a world and a complete state, and the world has what its kind takes."""
+    """Raise ValueError unless these are a World and a complete State, and a crowd has no forces, joints or width."""
     if not isinstance(world, World) or not isinstance(state, State):
         raise ValueError(
             f"expected (world, state), got ({type(world).__name__}, {type(state).__name__}): "

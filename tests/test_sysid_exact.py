@@ -178,7 +178,9 @@ def test_what_lies_beyond_the_last_window_is_left_out(records, fit):
 def test_numbers_of_a_fit_by_the_names_of_its_table(fit):
     assert fit["gravity[1]"].value == fit["gravity"].value[1] and fit["gravity[1]"].low == fit["gravity"].low[1]
     assert_allclose(fit["p.v[0]"].value, fit["p.v"].value[:, 0])
-    for name in ("gravity[2]", "p.v[2]", "p.w"):
+    assert_allclose(fit["p.v{1}"].value, fit["p.v"].value[1])
+    assert fit["p.v{1}[0]"].high == fit["p.v"].high[1, 0]
+    for name in ("gravity[2]", "p.v[2]", "p.w", "p.v{9}", "gravity{0}"):
         with pytest.raises(KeyError, match="there are"):
             fit[name]
 

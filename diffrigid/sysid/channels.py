@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffrigid import joint_motion
+from diffrigid.catalogue import component
 from diffrigid.convert import nearest, numbers, unit_quaternion
-from diffrigid.paths import component
 from diffrigid.pytree import array_fields, letters_of, replace
 from diffrigid.state import State, axis_sizes
 from diffrigid.sysid.sensors import Channel, Component, Function, JointPart, Part, is_turn, seen

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from diffrigid.catalogue import component
 from diffrigid.controls import controlled
 from diffrigid.convert import nearest
-from diffrigid.paths import component
 from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.sensors import Channel, Part
 from diffrigid.world import World

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from diffrigid import paths
+from diffrigid.catalogue import component, order_of
 from diffrigid.convert import known
 from diffrigid.models.frames import to_quaternion
 from diffrigid.state import State, rotations
@@ -29,7 +30,7 @@ def begun(run: Run, slots: Sequence[Slot]) -> Run:
     values: dict[str, np.ndarray] = {}
     for slot in slots:
         if isinstance(slot.kind, Free) or slot.kind.name == "rotation":
-            whole, index = paths.component(slot.paths[0])
+            whole, index = component(slot.paths[0])
             if whole in seen:
                 value = seen[whole] if index is None else seen[whole][index]
                 values |= dict.fromkeys(slot.paths, np.clip(value, *_ends(slot)))
@@ -45,14 +46,14 @@ def is_begun(run: Run, slots: Sequence[Slot]) -> bool:
     if run.stated:
         return True
     seen, there = shown(run.world, run.series, run.channels, run.start), paths.catalogue(run.world)
-    wholes = {paths.component(path)[0] for slot in slots for path in slot.paths}
+    wholes = {component(path)[0] for slot in slots for path in slot.paths}
     initial = [whole for whole in wholes if whole in there and there[whole][0].chain[0] == 1]
     return all(np.isfinite(seen.get(whole, np.nan)).all() for whole in initial)
 
 
 def with_values(world: World, state: State, values: Mapping[str, np.ndarray]) -> State:
     """A state with these values by path, except where they are NaN."""
-    for path in sorted(values, key=lambda path: paths.order_of(world, path)):
+    for path in sorted(values, key=lambda path: order_of(world, path)):
         now = np.asarray(paths.read(world, state, path))
         value = np.reshape(values[path], now.shape).astype(now.dtype)
         state = paths.write(world, state, path, np.where(np.isfinite(value), value, now))[1]

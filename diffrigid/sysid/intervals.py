@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from diffrigid.catalogue import component, unit
 from diffrigid.compiling import QUICK, compiled, uncollected
-from diffrigid.paths import component, unit, write
+from diffrigid.paths import write
 from diffrigid.state import State
 from diffrigid.sysid.covariance import LEAST_FREE, TINY, Linear, Uncertainty, joint_covariance, own_covariance
 from diffrigid.sysid.diagnosis import (

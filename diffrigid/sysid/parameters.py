@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from diffrigid import paths
+from diffrigid.catalogue import component, hint, order_of
 from diffrigid.pytree import replace
 from diffrigid.state import State
 from diffrigid.sysid.channels import is_record, parts_of
@@ -70,7 +71,7 @@ def write(scene: Scene, path: str, value: Array) -> Scene:
 
 def knows(scene: Scene, path: str) -> bool:
     """Whether the scene has such a parameter."""
-    return path in channel_paths(scene.channels) or paths.component(path)[0] in paths.catalogue(scene.world)
+    return path in channel_paths(scene.channels) or component(path)[0] in paths.catalogue(scene.world)
 
 
 def channel_paths(channels: dict[str, Channel]) -> dict[str, list[tuple[str, ...]]]:
@@ -128,7 +129,7 @@ def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
             value = slot.kind.value(z[rows], reference(slot, scene))
             numbers += [(path, value[k] if slot.is_vector else value) for k, path in enumerate(slot.paths)]
     # In order: joints move bodies once anchors and velocities are as they will be.
-    for path, value in sorted(numbers, key=lambda number: paths.order_of(scene.world, number[0])):
+    for path, value in sorted(numbers, key=lambda number: order_of(scene.world, number[0])):
         scene = write(scene, path, value)
     return scene
 
@@ -178,7 +179,7 @@ def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unli
         slot = replace(slot, name=" : ".join(names))
     shape = reference(slot, having[0]).shape
     size = kind.size(shape)
-    if isinstance(kind, Free) and paths.component(names[0])[0].endswith(".inertia") and having[0].world.dim == 3:
+    if isinstance(kind, Free) and component(names[0])[0].endswith(".inertia") and having[0].world.dim == 3:
         raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
     for scene in having:
         kind.check(f"free[{key!r}]", np.asarray(reference(slot, scene)))
@@ -192,9 +193,7 @@ def _refuse_ambiguous(names: tuple[str, ...], scenes: Sequence[Scene]) -> None:
     for name in names:
         if name == "contact.width":
             raise ValueError("free: 'contact.width' is not a property of a body: give `fit` the widths to go through")
-        if any(
-            name in channel_paths(s.channels) and paths.component(name)[0] in paths.catalogue(s.world) for s in scenes
-        ):
+        if any(name in channel_paths(s.channels) and component(name)[0] in paths.catalogue(s.world) for s in scenes):
             raise ValueError(
                 f"free: {name!r} is a parameter of the world and of a column: give the column another name"
             )
@@ -205,7 +204,7 @@ def _refuse_overlaps(slots: Sequence[Slot], scene: Scene) -> None:
     known, of_columns = paths.catalogue(scene.world), channel_paths(scene.channels)
     taken: dict[tuple, list[tuple[Any, Any, str]]] = {}
     for path in (path for slot in slots for path in slot.paths if path not in of_columns):
-        whole, index = paths.component(path)
+        whole, index = component(path)
         for place in known.get(whole, []):
             for row, item, other in taken.setdefault(place.chain, []):
                 if all(a is None or b is None or a == b for a, b in ((row, place.row), (item, index))):
@@ -219,5 +218,5 @@ def _refuse(names: tuple[str, ...], having: Sequence[Scene], scenes: Sequence[Sc
         if lacking:
             catalogue = [*channel_paths(lacking[0].channels), *paths.catalogue(lacking[0].world)]
             where = "this world" if not having else "the scene of every record, as a parameter of `each` has to be"
-            raise ValueError(f"free: no parameter {name!r} in {where}: {paths.hint(lacking[0].world, name, catalogue)}")
+            raise ValueError(f"free: no parameter {name!r} in {where}: {hint(lacking[0].world, name, catalogue)}")
     raise ValueError(f"free: no scene has all of {names}: tie only what is in one scene")

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.catalogue import catalogue, component
 from diffrigid.constraints import joint_errors, placed
 from diffrigid.flight import has_torque
 from diffrigid.joint_motion import fields_of, moving_side
-from diffrigid.paths import catalogue, component, read, write
+from diffrigid.paths import read, write
 from diffrigid.shapes import Disc, Sphere
 from diffrigid.state import rotations
 from diffrigid.sysid.covariance import Linear

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid import paths
+from diffrigid.catalogue import component
 from diffrigid.convert import at_least_one
 from diffrigid.state import State, rotations
 from diffrigid.sysid.charts import rotation
@@ -140,7 +141,7 @@ def _initial(world: World, key: Any) -> bool:
     """Whether a path, or a tuple of paths, is part of the initial state."""
     names = [key] if isinstance(key, str) else key
     known = paths.catalogue(world)
-    return any(place.chain[0] == 1 for name in names for place in known.get(paths.component(name)[0], []))
+    return any(place.chain[0] == 1 for name in names for place in known.get(component(name)[0], []))
 
 
 def _own_states(world: World, observations: Any) -> dict[str, Each]:

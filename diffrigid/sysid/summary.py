@@ -2,6 +2,7 @@
 
 import json
 import platform
+import re
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffrigid.paths import component
+from diffrigid.catalogue import component
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.table import HEADER, numbers, rows_of, summary_html, summary_text
 from diffrigid.tables import lined_up
@@ -48,10 +49,15 @@ class Summary:
     versions: dict[str, str]
 
     def __getitem__(self, name: str) -> Parameter:
-        """A parameter by its path, a component by "ball.v[0]", or one of several paths that were fitted together."""
+        """A parameter by its path, a component by "ball.v[0]", one of several paths that were fitted together, or the
+        number of one record as the table has it, "ball.v{1}[0]"."""
         for parameter in self.parameters:
             if parameter.name == name:
                 return parameter
+        if own := re.fullmatch(r"(.+)\{(\d+)\}(.*)", name, re.DOTALL):
+            p, k = self[own[1] + own[3]], int(own[2])
+            if k < p.records:
+                return replace(p, name=name, value=p.value[k], low=p.low[k], high=p.high[k], records=0)
         whole, index = component(name)
         for p in self.parameters:
             if p.name == whole and index is not None and p.value.ndim > bool(p.records) and index < p.value.shape[-1]:
