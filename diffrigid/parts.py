@@ -28,8 +28,8 @@ class Part:
         >>> head = dr.Part(dr.Box(half=(0.02, 0.05)), x=(0.15, 0.0), mass=0.4)
         >>> handle = dr.Part(dr.Box(half=(0.15, 0.01)), mass=0.1)
         >>> hammer = dr.Body({"handle": handle, "head": head}, x=(0.0, 1.0))
-        >>> made, _ = dr.scene({"hammer": hammer})
-        >>> round(float(dr.paths.read(made, _, "hammer.shape.head.x")[0]), 4)  # from the centre of mass
+        >>> made, start = dr.scene({"hammer": hammer})
+        >>> round(float(dr.paths.read(made, start, "hammer.shape.head.x")[0]), 4)  # from the centre of mass
         0.03
     """
 
@@ -110,7 +110,12 @@ def solid_of(name: str, body: Any, pieces: Sequence[Piece], dim: int) -> Solid |
             )
         center = numbers(f"{name}.center", body.center, (dim,))
         return _solid(name, pieces, dim)._replace(center=center)
-    return _solid(name, pieces, dim) if pieces else None
+    if not pieces:
+        return None
+    solid = _solid(name, pieces, dim)
+    if pieces[0].name and solid.mass is None and not traced(solid.volume) and not solid.volume > 0:
+        raise ValueError(f"{name}.shape: its parts have no volume to share the mass by: give each part a mass.")
+    return solid
 
 
 def _solid(name: str, pieces: Sequence[Piece], dim: int) -> Solid:
@@ -124,10 +129,7 @@ def _solid(name: str, pieces: Sequence[Piece], dim: int) -> Solid:
     shapes, x, q = zip(*((piece.shape, piece.x, piece.q) for piece in pieces), strict=True)
     masses = given or None
     volume, center, gyration = known(partial(_assembly_properties, dim=dim), shapes, x, q, masses)
-    solid = Solid(volume, center, gyration, mass=sum(masses) if masses else None)
-    if masses is None and not traced(solid.volume) and not solid.volume > 0:
-        raise ValueError(f"{name}.shape: its parts have no volume to share the mass by: give each part a mass.")
-    return solid
+    return Solid(volume, center, gyration, mass=sum(masses) if masses else None)
 
 
 # One program each, in place of some dozen.

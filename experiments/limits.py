@@ -1,0 +1,163 @@
+"""How inexact are the cases that notebooks/limits.md names?
+
+    python experiments/limits.py [--case NAME ...]
+
+Each case prints the figures of one sentence there: how far a motion at steps of 1/60 and 1/240 s is from the same at
+steps of 1/3840 s, or how much energy it gains or loses. Double precision; some minutes for all, most of them compiling.
+"""
+
+import argparse
+
+import jax
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+
+import diffrigid as dr  # noqa: E402
+
+STEPS = (1 / 60, 1 / 240)  # [s]
+FINE = 1 / 3840  # [s]
+G = 9.81
+DOWN = {"gravity": (0.0, -G)}
+FLOOR = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+
+
+def end(pair, dt, seconds):
+    return jax.tree.map(lambda leaf: leaf[-1], dr.rollout(*pair, dt=dt, steps=round(seconds / dt)).state)
+
+
+def off(pair, seconds, what):
+    """How far `what` of the last state is from that at fine steps, for each of STEPS."""
+    right = what(end(pair, FINE, seconds))
+    return [float(np.abs(what(end(pair, dt, seconds)) - right).max()) for dt in STEPS]
+
+
+def energy(world, state):
+    """Kinetic and potential energy [J] of one state."""
+    lift = (world.bodies.mass * state.x[:, -1]).sum() * G
+    return float(dr.kinetic_energy(world.bodies, state).sum() + lift)
+
+
+def rod():
+    """A rod of 1 m that falls over from 0.1 rad on a floor without friction: part of its energy lost in 0.6 s."""
+    body = dr.Body(dr.Box(half=(0.5, 0.0)), mass=1.0, x=(0.0, 0.5 * np.cos(0.1)), angle=np.pi / 2 - 0.1)
+    pair = dr.scene({"rod": body, "floor": FLOOR}, **DOWN)
+    return [1.0 - energy(pair[0], end(pair, dt, 0.6)) / energy(*pair) for dt in STEPS], "of the energy"
+
+
+def dome():
+    """A disc that slides down a round dome without friction for half a second: its angle about the centre."""
+    at = 1.1 * np.array([np.sin(0.3), np.cos(0.3)])
+    disc = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=at)
+    pair = dr.scene({"disc": disc, "dome": dr.Static(dr.Disc(radius=1.0))}, **DOWN)
+    return off(pair, 0.5, lambda state: np.arctan2(state.x[0, 0], state.x[0, 1])), "rad"
+
+
+def weight():
+    """A disc with a weight welded to its rim that rolls against friction and turns back: its rate after a second."""
+    disc = dr.Body(dr.Disc(radius=0.2), mass=1.0, x=(0.0, 0.2), v=(0.2, 0.0), w=-1.0)
+    small = dr.Body(None, mass=0.5, inertia=1e-3, x=(0.0, 0.05), v=(0.05, 0.0), w=-1.0)
+    pair = dr.scene(
+        {"disc": disc, "weight": small, "floor": FLOOR},
+        joints=[dr.Weld("weight", "disc")], friction=1.0, rolling_friction=0.01, **DOWN,
+    )  # fmt: skip
+    return off(pair, 1.0, lambda state: state.w), "rad/s"
+
+
+def across():
+    """A ball that rolls across a slope of 0.2 rad against rolling friction: its velocity after 0.8 s."""
+    slope = dr.Static(dr.HalfSpace(normal=(np.sin(0.2), 0.0, np.cos(0.2))))
+    start = 0.1 * np.array([np.sin(0.2), 0.0, np.cos(0.2)])
+    ball = dr.Body(
+        dr.Sphere(radius=0.1), mass=1.0, x=start, v=(0.0, 1.0, 0.0), w=(-10.0 * np.cos(0.2), 0.0, 10.0 * np.sin(0.2))
+    )
+    pair = dr.scene({"ball": ball, "slope": slope}, gravity=(0.0, 0.0, -G), friction=0.5, rolling_friction=0.01)
+    return off(pair, 0.8, lambda state: state.v), "m/s"
+
+
+def rider():
+    """A heavy block on a light one that slides on the floor, until its slip stops: where the light one is.
+
+    100, 1000 and 10,000 times as heavy; at 1/60 s.
+    """
+    found = []
+    for mass in (1e2, 1e3, 1e4):
+        light = dr.Body(dr.Box(half=(0.5, 0.1)), mass=1.0, x=(0.0, 0.1), friction=0.3)
+        heavy = dr.Body(dr.Box(half=(0.1, 0.1)), mass=mass, x=(0.0, 0.3), v=(1.0, 0.0), friction=0.3)
+        pair = dr.scene({"light": light, "heavy": heavy, "floor": dr.replace(FLOOR, friction=0.1)}, **DOWN)
+        found.append(off(pair, 0.5, lambda state: state.x[0])[0])
+    return found, "m"
+
+
+def graze():
+    """Two discs that graze at 2 m/s, 1e-8 of their size deep, where a step ends: how much too fast they part."""
+    found = []
+    for rest_speed in (1e-3, 0.0):
+        disc, depth = dr.Disc(radius=0.5), 1e-8
+        one = dr.Body(disc, mass=1.0, x=(-2.0 / 60, 0.5 - depth / 2), v=(2.0, 0.0))
+        two = dr.Body(disc, mass=1.0, x=(0.0, -0.5 + depth / 2))
+        pair = dr.scene({"one": one, "two": two}, contact=dr.Contact(rest_speed=rest_speed))
+        found.append(float(np.abs(end(pair, 1 / 60, 0.1).v[:, 1]).max()))
+    return found, "m/s, with rest_speed 1e-3 and 0"
+
+
+def arms():
+    """Two bodies of 10 cm on arms of 10 m and 1 m that a hinge joins, at 4 rad/s for a second: energy changed."""
+    small = {"mass": 1.0, "inertia": 0.5 * 0.1**2}
+    one = dr.Body(None, x=(-10.0, 0.0), v=(0.0, -40.0), w=4.0, **small)
+    two = dr.Body(None, x=(1.0, 0.0), **small)
+    pair = dr.scene({"one": one, "two": two}, joints=[dr.Revolute("one", "two", anchor_a=(10.0, 0.0))])
+    before = float(dr.kinetic_energy(pair[0].bodies, pair[1]).sum())
+    after = [float(dr.kinetic_energy(pair[0].bodies, end(pair, dt, 1.0)).sum()) for dt in STEPS]
+    return [abs(e / before - 1.0) for e in after], "of the energy"
+
+
+def hold():
+    """A box on an arm that the friction of a hinge holds: how fast it sinks."""
+    arm = dr.Body(dr.Box(half=(0.5, 0.02)), mass=1.0, x=(0.5, 1.0), friction=0.5)
+    box = dr.Body(dr.Box(half=(0.05, 0.05)), mass=1.0, x=(0.9, 1.07), friction=0.5)
+    joint = dr.Revolute("arm", anchor_a=(-0.5, 0.0), friction=100.0)
+    pair = dr.scene({"arm": arm, "box": box}, joints=[joint], **DOWN)
+    return [float(pair[1].x[1, 1] - end(pair, dt, 2.0).x[1, 1]) / 2.0 for dt in STEPS], "m/s"
+
+
+def falls():
+    """Boxes of 1 to 100 mm that fall over with friction of 1 to 100: of 128, those that gain a thousandth of energy."""
+    rng = np.random.default_rng(0)
+    half = np.exp(rng.uniform(np.log(5e-4), np.log(5e-2), (128, 2)))
+    mu, angle = np.exp(rng.uniform(0.0, np.log(100.0), 128)), rng.uniform(0.05, 1.5, 128)
+    height = half[:, 0] * np.sin(angle) + half[:, 1] * np.cos(angle)  # of the centre, with a corner on the floor
+    scene = dr.scene({"box": dr.Body(dr.Box(half=(0.1, 0.1)), mass=1.0, x=(0.0, 1.0)), "floor": FLOOR}, **DOWN)
+
+    def made(half, mu, angle, height):
+        pair = dr.paths.write(*scene, "box.shape.half", half)
+        for path, value in (("box.density", 1e3), ("friction", mu), ("box.angle", angle), ("box.x[1]", height)):
+            pair = dr.paths.write(*pair, path, value)
+        return pair
+
+    worlds, states = jax.vmap(made)(half, mu, angle, height)
+    mass, inertia = worlds.bodies.mass, worlds.bodies.inertia  # (B, 1)
+    found = []
+    for dt in STEPS:
+        path = dr.rollout_batch(worlds, states, dt=dt, steps=round(0.5 / dt))
+        kinetic = 0.5 * mass * (path.v[:, :, 0] ** 2).sum(2) + 0.5 * inertia * path.w[:, :, 0, 0] ** 2
+        total = kinetic + mass * G * path.x[:, :, 0, 1]
+        found.append(int((total.max(1) > 1.001 * total[:, 0]).sum()))
+    return found, "boxes"
+
+
+CASES = {case.__name__: case for case in (rod, dome, weight, across, rider, graze, arms, hold, falls)}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--case", nargs="+", choices=CASES, default=list(CASES))
+    for name in parser.parse_args().case:
+        values, unit = CASES[name]()
+        print(
+            f"{name:8} {'  '.join(f'{value:.2g}' for value in values)}  {unit}: {CASES[name].__doc__.splitlines()[0]}"
+        )
+
+
+if __name__ == "__main__":
+    main()
