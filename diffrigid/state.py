@@ -81,31 +81,35 @@ def spin(bodies: Bodies, state: State) -> Array:
 
 
 def kinetic_energy(bodies: Bodies, state: State) -> Array:
-    """Kinetic energy of each body, m v.v / 2 + w.L / 2, (N, *batch) [J].
+    """Kinetic energy of each body, m v.v / 2 + w.L / 2, (N, *batch) [J]; of states as `rollout` has them (..., N).
 
     Raises:
-        ValueError: a state that is not of these bodies, or of many times.
+        ValueError: a state that is not of these bodies.
 
     Example:
-        >>> energy = jax.vmap(dr.kinetic_energy, (None, 0))(world.bodies, trajectory.state)  # (T+1, N)
+        >>> energy = dr.kinetic_energy(world.bodies, trajectory.state)  # (T+1, N)
         >>> round(float(energy[-1, 0]), 4)
         3.5348
     """
+    if _times_first(state):
+        return jax.vmap(kinetic_energy, (None, 0))(bodies, state)
     bodies, state = _together(bodies, state)
     linear = bodies.mass * (state.v * state.v).sum(1)
     return 0.5 * (linear + (state.w * spin(bodies, state)).sum(1))
 
 
 def momentum(bodies: Bodies, state: State) -> Array:
-    """Linear momentum of each body, m v, (N, D, *batch) [kg m/s].
+    """Linear momentum of each body, m v, (N, D, *batch) [kg m/s]; of states as `rollout` has them (..., N, D).
 
     Raises:
-        ValueError: a state that is not of these bodies, or of many times.
+        ValueError: a state that is not of these bodies.
 
     Example:
         >>> dr.momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()
         [[2.0, 0.0]]
     """
+    if _times_first(state):
+        return jax.vmap(momentum, (None, 0))(bodies, state)
     bodies, state = _together(bodies, state)
     return bodies.mass[:, None] * state.v
 
@@ -113,13 +117,17 @@ def momentum(bodies: Bodies, state: State) -> Array:
 def angular_momentum(bodies: Bodies, state: State) -> Array:
     """Angular momentum of each body about the world origin, x * p + L, (N, A, *batch) [kg m^2/s].
 
+    Of states as `rollout` has them (..., N, A).
+
     Raises:
-        ValueError: a state that is not of these bodies, or of many times.
+        ValueError: a state that is not of these bodies.
 
     Example:
         >>> dr.angular_momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()  # no spin: an arm
         [[-2.0]]
     """
+    if _times_first(state):
+        return jax.vmap(angular_momentum, (None, 0))(bodies, state)
     bodies, state = _together(bodies, state)
     orbital = jax.vmap(rotations(bodies.dim).moment)(state.x, momentum(bodies, state))
     return orbital + spin(bodies, state)
@@ -127,57 +135,67 @@ def angular_momentum(bodies: Bodies, state: State) -> Array:
 
 def _together(bodies: Bodies, state: State) -> tuple[Bodies, State]:
     """Bodies and a state of them, with the same number of batch axes."""
-    count = len(bodies.mass)
-    _refuse_times(state, bodies.dim, count, "jax.vmap(dr.kinetic_energy, (None, 0))(world.bodies, trajectory.state)")
+    _check_sizes(state, bodies.dim, len(bodies.mass))
     return tuple(align_all(bodies, state))
 
 
-def _refuse_times(state: State, dim: int, count: int, instead: str) -> None:
-    """Raise ValueError for a state that is not that of `count` bodies, as where an axis of times comes first."""
+def _times_first(state: State) -> bool:
+    """Whether the axes of times, or of worlds, come first, as in what `rollout` returns. D, Q and A tell."""
+    shapes = [jnp.shape(leaf) for leaf in (state.x, state.q, state.w)]
+    sizes = [tuple(axis_sizes(dim)[letter] for letter in "DQA") for dim in (2, 3)]
+    own, last = (tuple(shape[axis] for shape in shapes if len(shape) > 2) for axis in (1, -1))
+    return last in sizes and own not in sizes
+
+
+def _check_sizes(state: State, dim: int, count: int) -> None:
+    """Raise ValueError for a state that is not that of `count` bodies."""
     sizes = axis_sizes(dim)
     wanted = {name: (count, sizes[letter]) for name, letter in (("x", "D"), ("q", "Q"), ("v", "D"), ("w", "A"))}
     for name, shape in wanted.items():
         if (found := jnp.shape(getattr(state, name)))[:2] != shape:
             raise ValueError(
-                f"state.{name} has shape {found}: expected {shape}, and axes of a batch behind; of all times of a "
-                f"trajectory: {instead}"
+                f"state.{name} has shape {found}: expected {shape}, and axes of a batch behind, or of times in front"
             )
 
 
 def material_point(state: State, body: int, point: Vector) -> Array:
-    """World position of a point fixed to a body, r = R r_b + x, (D, *batch) [m].
+    """World position of a point fixed to a body, r = R r_b + x, (D, *batch) [m]; (..., D) of states as `rollout` has.
 
     Args:
         body: index of the body.
         point: (D, *batch) [m], body axes, from the centre of mass.
 
     Raises:
-        ValueError: a state of many times, no such body, a point of another dimension.
+        ValueError: no such body, a point of another dimension.
 
     Example:
         >>> quarter = dr.replace(state, q=jnp.array([[0.0, 1.0]]))
         >>> dr.material_point(quarter, 0, jnp.array([0.1, 0.0])).tolist()
         [0.0, 1.1]
     """
+    if _times_first(state):
+        return jax.vmap(material_point, (0, None, None))(state, body, jnp.asarray(point))
     state, point = _aligned(state, body, point)
     return state.x[body] + rotations(state.x.shape[1]).rotate(state.q[body], point)
 
 
 def material_velocity(state: State, body: int, point: Vector) -> Array:
-    """World velocity of a point fixed to a body, v + w x (R r_b), (D, *batch) [m/s].
+    """World velocity of a point fixed to a body, v + w x (R r_b), (D, *batch) [m/s]; (..., D) likewise.
 
     Args:
         body: index of the body.
         point: (D, *batch) [m], body axes, from the centre of mass.
 
     Raises:
-        ValueError: a state of many times, no such body, a point of another dimension.
+        ValueError: no such body, a point of another dimension.
 
     Example:
         >>> spinning = dr.replace(state, w=jnp.array([[5.0]]))
         >>> dr.material_velocity(spinning, 0, jnp.array([0.1, 0.0])).tolist()
         [0.0, 0.5]
     """
+    if _times_first(state):
+        return jax.vmap(material_velocity, (0, None, None))(state, body, jnp.asarray(point))
     state, point = _aligned(state, body, point)
     so = rotations(state.x.shape[1])
     return state.v[body] + so.cross(state.w[body], so.rotate(state.q[body], point))
@@ -186,7 +204,7 @@ def material_velocity(state: State, body: int, point: Vector) -> Array:
 def _aligned(state: State, body: int, point: Vector) -> tuple[State, Array]:
     """State and a point (D, *batch) with the same number of batch axes."""
     point, count, dim = jnp.asarray(point), len(state.x), 2 if state.q.shape[1] == 2 else 3
-    _refuse_times(state, dim, count, "jax.vmap(lambda state: dr.material_point(state, 0, point))(trajectory.state)")
+    _check_sizes(state, dim, count)
     if not isinstance(body, jax.core.Tracer) and not (isinstance(body, int | np.integer) and -count <= body < count):
         fix = f"world.names.index({body!r})" if isinstance(body, str) else "as in world.names"
         raise ValueError(f"body is {body!r}: expected the number of a body, from 0 to {count - 1}, {fix}")

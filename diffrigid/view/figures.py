@@ -87,10 +87,9 @@ def momentum(trajectory: Trajectory, angular: bool = False, ax: Any = None) -> A
         ValueError: many motions.
     """
     world, ax, t = checked(trajectory).world, _axes(ax), np.asarray(trajectory.t)
-    last = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), 0, -1), trajectory.state)
     of = of_state.angular_momentum if angular else of_state.momentum
-    total = np.asarray(of(world.bodies, last)).sum(0)
-    for column, name in zip(total, "xyz" if len(total) > 1 else "z", strict=False):
+    total = np.asarray(of(world.bodies, trajectory.state)).sum(1)  # (T, D or A)
+    for column, name in zip(total.T, "xyz" if total.shape[1] > 1 else "z", strict=False):
         ax.plot(t, column, label=name)
     return _labelled(ax, "time [s]", "angular momentum [N m s]" if angular else "momentum [N s]")
 

@@ -160,8 +160,7 @@ def links(world: World) -> list[dict[str, Any]]:
 
 def energies(world: World, state: State) -> np.ndarray:
     """Columns [J]: kinetic, potential (gravity, and springs), their sum; of states with a leading time axis."""
-    last = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf), 0, -1), state)
-    kinetic = np.asarray(kinetic_energy(world.bodies, last), float).sum(0)
+    kinetic = np.asarray(kinetic_energy(world.bodies, state), float).sum(1)
     x, mass = np.asarray(state.x, float), np.asarray(world.bodies.mass, float)
     potential = np.zeros(len(x))
     for force in world.forces:
