@@ -39,10 +39,10 @@ def energy(world, state):
 
 
 def rod():
-    """A rod of 1 m that falls over from 0.1 rad on a floor without friction: part of its energy lost in 0.6 s."""
+    """A rod of 1 m that falls over from 0.1 rad on a floor without friction, 0.5 s: part of its energy lost."""
     body = dr.Body(dr.Box(half=(0.5, 0.0)), mass=1.0, x=(0.0, 0.5 * np.cos(0.1)), angle=np.pi / 2 - 0.1)
     pair = dr.scene({"rod": body, "floor": FLOOR}, **DOWN)
-    return [1.0 - energy(pair[0], end(pair, dt, 0.6)) / energy(*pair) for dt in STEPS], "of the energy"
+    return [1.0 - energy(pair[0], end(pair, dt, 0.5)) / energy(*pair) for dt in STEPS], "of the energy"
 
 
 def dome():
@@ -51,17 +51,6 @@ def dome():
     disc = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=at)
     pair = dr.scene({"disc": disc, "dome": dr.Static(dr.Disc(radius=1.0))}, **DOWN)
     return off(pair, 0.5, lambda state: np.arctan2(state.x[0, 0], state.x[0, 1])), "rad"
-
-
-def weight():
-    """A disc with a weight welded to its rim that rolls against friction and turns back: its rate after a second."""
-    disc = dr.Body(dr.Disc(radius=0.2), mass=1.0, x=(0.0, 0.2), v=(0.2, 0.0), w=-1.0)
-    small = dr.Body(None, mass=0.5, inertia=1e-3, x=(0.0, 0.05), v=(0.05, 0.0), w=-1.0)
-    pair = dr.scene(
-        {"disc": disc, "weight": small, "floor": FLOOR},
-        joints=[dr.Weld("weight", "disc")], friction=1.0, rolling_friction=0.01, **DOWN,
-    )  # fmt: skip
-    return off(pair, 1.0, lambda state: state.w), "rad/s"
 
 
 def across():
@@ -89,18 +78,6 @@ def rider():
     return found, "m"
 
 
-def graze():
-    """Two discs that graze at 2 m/s, 1e-8 of their size deep, where a step ends: how much too fast they part."""
-    found = []
-    for rest_speed in (1e-3, 0.0):
-        disc, depth = dr.Disc(radius=0.5), 1e-8
-        one = dr.Body(disc, mass=1.0, x=(-2.0 / 60, 0.5 - depth / 2), v=(2.0, 0.0))
-        two = dr.Body(disc, mass=1.0, x=(0.0, -0.5 + depth / 2))
-        pair = dr.scene({"one": one, "two": two}, contact=dr.Contact(rest_speed=rest_speed))
-        found.append(float(np.abs(end(pair, 1 / 60, 0.1).v[:, 1]).max()))
-    return found, "m/s, with rest_speed 1e-3 and 0"
-
-
 def arms():
     """Two bodies of 10 cm on arms of 10 m and 1 m that a hinge joins, at 4 rad/s for a second: energy changed."""
     small = {"mass": 1.0, "inertia": 0.5 * 0.1**2}
@@ -121,32 +98,7 @@ def hold():
     return [float(pair[1].x[1, 1] - end(pair, dt, 2.0).x[1, 1]) / 2.0 for dt in STEPS], "m/s"
 
 
-def falls():
-    """Boxes of 1 to 100 mm that fall over with friction of 1 to 100: of 128, those that gain a thousandth of energy."""
-    rng = np.random.default_rng(0)
-    half = np.exp(rng.uniform(np.log(5e-4), np.log(5e-2), (128, 2)))
-    mu, angle = np.exp(rng.uniform(0.0, np.log(100.0), 128)), rng.uniform(0.05, 1.5, 128)
-    height = half[:, 0] * np.sin(angle) + half[:, 1] * np.cos(angle)  # of the centre, with a corner on the floor
-    scene = dr.scene({"box": dr.Body(dr.Box(half=(0.1, 0.1)), mass=1.0, x=(0.0, 1.0)), "floor": FLOOR}, **DOWN)
-
-    def made(half, mu, angle, height):
-        pair = dr.paths.write(*scene, "box.shape.half", half)
-        for path, value in (("box.density", 1e3), ("friction", mu), ("box.angle", angle), ("box.x[1]", height)):
-            pair = dr.paths.write(*pair, path, value)
-        return pair
-
-    worlds, states = jax.vmap(made)(half, mu, angle, height)
-    mass, inertia = worlds.bodies.mass, worlds.bodies.inertia  # (B, 1)
-    found = []
-    for dt in STEPS:
-        path = dr.rollout_batch(worlds, states, dt=dt, steps=round(0.5 / dt))
-        kinetic = 0.5 * mass * (path.v[:, :, 0] ** 2).sum(2) + 0.5 * inertia * path.w[:, :, 0, 0] ** 2
-        total = kinetic + mass * G * path.x[:, :, 0, 1]
-        found.append(int((total.max(1) > 1.001 * total[:, 0]).sum()))
-    return found, "boxes"
-
-
-CASES = {case.__name__: case for case in (rod, dome, weight, across, rider, graze, arms, hold, falls)}
+CASES = {case.__name__: case for case in (rod, dome, across, rider, arms, hold)}
 
 
 def main():
