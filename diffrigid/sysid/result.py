@@ -59,7 +59,7 @@ class Fit:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Fitted parameters with 95 % intervals: first those that all records share, then those of each record."""
+        """Fitted parameters with 95 % intervals, first those that all records share, then those of each record."""
         return self.summary.parameters
 
     @property
@@ -74,7 +74,7 @@ class Fit:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion: of two models of the same records, the one with the smaller value should predict better.
+        """Akaike's criterion, by which of two models of the same records that with the smaller value predicts better.
 
         2 k - 2 log L, with k the number of fitted numbers, including those of the noise, and L the likelihood. `costs`
         cannot compare models where the noise is estimated: each is then in units of its own residuals.
