@@ -9,6 +9,7 @@ from jax import lax
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
+from diffrigid.state import rotations
 
 G = 9.81
 EXACT = 1e-9
@@ -286,6 +287,19 @@ def test_mistakes_are_named_with_their_fix(name):
     message, joint = MISTAKES[name]
     with pytest.raises(ValueError, match=message):
         dr.scene(ARM, joints=joint if isinstance(joint, dict) else [joint])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_weld_far_off_is_put_right_the_short_way(dim):
+    """By more than a quarter of a turn, where the sine of the angle would lead to half a turn."""
+    unturned, inertia = np.eye(2 if dim == 2 else 4)[0], 1.0 if dim == 2 else (1.0,) * 3
+    bodies = {name: dr.Body(None, mass=1.0, inertia=inertia, x=np.full(dim, x)) for name, x in (("a", 0.0), ("b", 0.5))}
+    world, state = dr.scene(bodies, joints=[dr.Weld("a", "b")])
+    turn = np.array([2.5]) if dim == 2 else 2.5 * np.array([0.48, 0.64, 0.6])
+    off = dr.replace(state, q=state.q.at[0].set(rotations(dim).exp(turn)))
+    q = dr.rollout(world, off, dt=1 / 60, steps=5).state.q[-1]
+    assert_allclose(jnp.abs(rotations(dim).difference(q[1], q[0])), unturned, atol=1e-9)
+    assert rotations(dim).difference(q[1], q[0])[0] > 0 or dim == 3  # q and -q are one turn in space
 
 
 def test_a_start_that_tears_a_joint_is_reported():
