@@ -11,7 +11,7 @@ from diffrigid.collide import COLLIDERS
 from diffrigid.convert import nearest
 from diffrigid.pytree import align_all
 from diffrigid.shapes import UNEVEN
-from diffrigid.state import State, rotations
+from diffrigid.state import State, at_place
 from diffrigid.step import floats
 from diffrigid.world import World, check, seated, seats
 
@@ -53,12 +53,11 @@ def _placed(world: World, state: State, name: str) -> list[tuple[Any, Array, Arr
         raise ValueError(f"gap: {name!r} is neither a body nor a static: {nearest(name, names)}")
     k, moving = names.index(name), len(world.names)
     x, q = (state.x[k], state.q[k]) if k < moving else (world.statics.x[k - moving], world.statics.q[k - moving])
-    so, found = rotations(world.dim), []
+    found = []
     for shape, r, turn in (seated(world, seat) for seat in seats(world) if seat.owner == k):
         if isinstance(shape, UNEVEN):
             raise ValueError(f"gap: {name!r} is a {type(shape).__name__}, to which there is no distance")
-        origin = x if r is None else x + so.rotate(q, r)
-        found.append((shape, origin, q if turn is None else so.compose(q, turn)))
+        found.append((shape, *at_place(x, q, r, turn)))
     if not found:
         raise ValueError(f"gap: {name!r} has no shape, from which to find a distance")
     return found

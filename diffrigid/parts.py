@@ -53,50 +53,50 @@ class Piece(NamedTuple):
 
 def check_shapes(name: str, shape: Any) -> None:
     """Raise ValueError if a body, or a static, cannot have this shape or these parts."""
-    if not isinstance(shape, Mapping):
-        if isinstance(shape, Part):
-            raise ValueError(f"{name}.shape is a Part: expected a shape, or parts by name, {{'head': Part(...)}}.")
-        check_shape(shape, f"{name}.shape")
-        return
-    if not shape:
+    several = isinstance(shape, Mapping)
+    if isinstance(shape, Part):
+        raise ValueError(f"{name}.shape is a Part: expected a shape, or parts by name, {{'head': Part(...)}}.")
+    if several and not shape:
         raise ValueError(f"{name}.shape is empty: expected parts by name, {{'head': Part(...)}}, or None.")
-    for key, part in shape.items():
+    for key in shape if several else ():
         if not isinstance(key, str) or not key or "." in key:
             raise ValueError(f"{name}.shape: {key!r} is not a name: expected a string without dots; rename the part.")
-        inner = part.shape if isinstance(part, Part) else part
-        check_shape(inner, f"{name}.shape.{key}")
-        if isinstance(inner, BOUNDLESS):
-            kind = type(inner).__name__
-            raise ValueError(f"{name}.shape.{key} is a {kind}, which has no mass: make it a Static of its own.")
+    for path, part in _by_path(name, shape).items():
+        check_shape(part.shape, path)
+        if several and isinstance(part.shape, BOUNDLESS):
+            kind = type(part.shape).__name__
+            raise ValueError(f"{path} is a {kind}, which has no mass: make it a Static of its own.")
+
+
+def _by_path(name: str, shape: Any) -> dict[str, Part]:
+    """The parts of a body, or its only shape as one, by their paths."""
+    if not isinstance(shape, Mapping):
+        return {} if shape is None else {f"{name}.shape": Part(shape)}
+    parts = {key: part if isinstance(part, Part) else Part(part) for key, part in shape.items()}
+    return {f"{name}.shape.{key}": part for key, part in parts.items()}
 
 
 def dimensions(name: str, shape: Any) -> dict[str, int]:
     """Dimensions of those shapes of a body that have one, by their paths."""
-    parts = {f"{name}.shape.{key}": part for key, part in shape.items()} if isinstance(shape, Mapping) else {}
-    shapes = {path: part.shape if isinstance(part, Part) else part for path, part in parts.items()}
-    if shape is not None and not parts:
-        shapes = {f"{name}.shape": shape}
-    return {path: size for path, one in shapes.items() if (size := dimension(one))}
+    return {path: size for path, part in _by_path(name, shape).items() if (size := dimension(part.shape))}
 
 
 def pieces_of(name: str, shape: Any, dim: int) -> tuple[Piece, ...]:
     """The shapes of a collider, none for None."""
-    if shape is None:
-        return ()
+    parts = _by_path(name, shape)
     if not isinstance(shape, Mapping):
-        return (Piece("", shape_of(f"{name}.shape", shape, dim)),)
-    return tuple(_piece(f"{name}.shape.{key}", key, part, dim) for key, part in shape.items())
+        return tuple(Piece("", shape_of(path, part.shape, dim)) for path, part in parts.items())
+    return tuple(_piece(path, key, part, dim) for key, (path, part) in zip(shape, parts.items(), strict=True))
 
 
-def _piece(where: str, key: str, part: Part | Shape, dim: int) -> Piece:
-    placed = part if isinstance(part, Part) else Part(part)
-    turned = placed.angle is not None or placed.q is not None
+def _piece(where: str, key: str, part: Part, dim: int) -> Piece:
+    turned = part.angle is not None or part.q is not None
     return Piece(
         name=key,
-        shape=shape_of(where, placed.shape, dim),
-        x=numbers(f"{where}.x", [0.0] * dim if placed.x is None else placed.x, (dim,)),
-        q=orientation(where, placed, dim) if turned else None,
-        mass=None if placed.mass is None else positive(f"{where}.mass", placed.mass, "leave out what weighs nothing"),
+        shape=shape_of(where, part.shape, dim),
+        x=numbers(f"{where}.x", [0.0] * dim if part.x is None else part.x, (dim,)),
+        q=orientation(where, part, dim) if turned else None,
+        mass=None if part.mass is None else positive(f"{where}.mass", part.mass, "leave out what weighs nothing"),
     )
 
 

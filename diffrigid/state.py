@@ -3,7 +3,11 @@
 x is the centre of mass, in the world frame; v and w are in the world frame. Nothing derivable is stored.
 """
 
+import functools
+import inspect
+from collections.abc import Callable
 from types import ModuleType
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -80,6 +84,24 @@ def spin(bodies: Bodies, state: State) -> Array:
     return jax.vmap(rotations(bodies.dim).spin)(bodies.inertia, state.q, state.w)
 
 
+F = TypeVar("F", bound=Callable[..., Array])
+
+
+def _of_each(of_one: F) -> F:
+    """Decorator: `state`, and then the result, may have axes of times and worlds in front, as `rollout` has them."""
+    signature = inspect.signature(of_one)
+
+    @functools.wraps(of_one)
+    def of_all(*args: object, **named: object) -> Array:
+        given = signature.bind(*args, **named).arguments
+        if "state" not in given or not _times_first(given["state"]):
+            return of_one(*args, **named)
+        return jax.vmap(lambda state: of_all(**given | {"state": state}))(given["state"])
+
+    return cast(F, of_all)
+
+
+@_of_each
 def kinetic_energy(bodies: Bodies, state: State) -> Array:
     """Kinetic energy of each body, m v.v / 2 + w.L / 2, (N, *batch) [J]; of states as `rollout` has them (..., N).
 
@@ -91,13 +113,12 @@ def kinetic_energy(bodies: Bodies, state: State) -> Array:
         >>> round(float(energy[-1, 0]), 4)
         3.5348
     """
-    if _times_first(state):
-        return jax.vmap(kinetic_energy, (None, 0))(bodies, state)
     bodies, state = _together(bodies, state)
     linear = bodies.mass * (state.v * state.v).sum(1)
     return 0.5 * (linear + (state.w * spin(bodies, state)).sum(1))
 
 
+@_of_each
 def momentum(bodies: Bodies, state: State) -> Array:
     """Linear momentum of each body, m v, (N, D, *batch) [kg m/s]; of states as `rollout` has them (..., N, D).
 
@@ -108,12 +129,11 @@ def momentum(bodies: Bodies, state: State) -> Array:
         >>> dr.momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()
         [[2.0, 0.0]]
     """
-    if _times_first(state):
-        return jax.vmap(momentum, (None, 0))(bodies, state)
     bodies, state = _together(bodies, state)
     return bodies.mass[:, None] * state.v
 
 
+@_of_each
 def angular_momentum(bodies: Bodies, state: State) -> Array:
     """Angular momentum of each body about the world origin, x * p + L, (N, A, *batch) [kg m^2/s].
 
@@ -126,8 +146,6 @@ def angular_momentum(bodies: Bodies, state: State) -> Array:
         >>> dr.angular_momentum(world.bodies, dr.replace(state, v=jnp.array([[2.0, 0.0]]))).tolist()  # no spin: an arm
         [[-2.0]]
     """
-    if _times_first(state):
-        return jax.vmap(angular_momentum, (None, 0))(bodies, state)
     bodies, state = _together(bodies, state)
     orbital = jax.vmap(rotations(bodies.dim).moment)(state.x, momentum(bodies, state))
     return orbital + spin(bodies, state)
@@ -137,6 +155,12 @@ def _together(bodies: Bodies, state: State) -> tuple[Bodies, State]:
     """Bodies and a state of them, with the same number of batch axes."""
     _check_sizes(state, bodies.dim, len(bodies.mass))
     return tuple(align_all(bodies, state))
+
+
+def at_place(x: Array, q: Array, r: Array | None, turn: Array | None) -> tuple[Array, Array]:
+    """Where a shape is, and how turned, whose origin is at r on a body at x, turned by `turn`; None: at x, unturned."""
+    so = rotations(x.shape[0])
+    return x if r is None else x + so.rotate(q, r), q if turn is None else so.compose(q, turn)
 
 
 def _times_first(state: State) -> bool:
@@ -158,6 +182,7 @@ def _check_sizes(state: State, dim: int, count: int) -> None:
             )
 
 
+@_of_each
 def material_point(state: State, body: int, point: Vector) -> Array:
     """World position of a point fixed to a body, r = R r_b + x, (D, *batch) [m]; (..., D) of states as `rollout` has.
 
@@ -173,12 +198,11 @@ def material_point(state: State, body: int, point: Vector) -> Array:
         >>> dr.material_point(quarter, 0, jnp.array([0.1, 0.0])).tolist()
         [0.0, 1.1]
     """
-    if _times_first(state):
-        return jax.vmap(material_point, (0, None, None))(state, body, jnp.asarray(point))
     state, point = _aligned(state, body, point)
     return state.x[body] + rotations(state.x.shape[1]).rotate(state.q[body], point)
 
 
+@_of_each
 def material_velocity(state: State, body: int, point: Vector) -> Array:
     """World velocity of a point fixed to a body, v + w x (R r_b), (D, *batch) [m/s]; (..., D) likewise.
 
@@ -194,8 +218,6 @@ def material_velocity(state: State, body: int, point: Vector) -> Array:
         >>> dr.material_velocity(spinning, 0, jnp.array([0.1, 0.0])).tolist()
         [0.0, 0.5]
     """
-    if _times_first(state):
-        return jax.vmap(material_velocity, (0, None, None))(state, body, jnp.asarray(point))
     state, point = _aligned(state, body, point)
     so = rotations(state.x.shape[1])
     return state.v[body] + so.cross(state.w[body], so.rotate(state.q[body], point))

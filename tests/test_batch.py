@@ -168,8 +168,9 @@ def test_states_of_other_bodies_are_refused():
                 fn(world.bodies, states)
     for fn in (dr.material_point, dr.material_velocity):
         for body in (3, -4, "0", 0.0, None):
-            with pytest.raises(ValueError, match="body is .*expected the number of a body, from 0 to 2"):
-                fn(state, body, (0.1, 0.0))
+            for states in (state, jax.tree.map(lambda leaf: leaf[None], state)):
+                with pytest.raises(ValueError, match="body is .*expected the number of a body, from 0 to 2"):
+                    fn(state=states, body=body, point=(0.1, 0.0))
         with pytest.raises(ValueError, match=r"point has shape \(3,\): expected \(2,\)"):
             fn(state, 0, (0.1, 0.0, 0.0))
 

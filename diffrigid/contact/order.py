@@ -5,7 +5,7 @@ then, as the end of a step does, and a later pass applies the impact. An inelast
 once, because passed on from body to body it would never end. An elastic one is passed on, as in Newton's cradle.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -92,15 +92,10 @@ def in_order(
         waits, joins = until < jnp.inf, (rests | now) & ~bounces & (along < jnp.inf)
         now, held = (now & ~waits) | joins, held | (waits & rests)
         s = jnp.where(waits & rests, until, jnp.where(joins, along, s))
-    ordered, start = [], 0
-    for m in meetings:
-        own = slice(start, start + len(m.s))
-        hit = m.hit | held[own] | joins[own]
-        ordered.append(
-            replace(m, s=s[own], hit=hit, now=now[own] & ~at_end, joins=joins[own] & ~at_end, held=held[own])
-        )
-        start += len(m.s)
-    return ordered
+    return [
+        replace(m, s=s, hit=m.hit | held | joins, now=now & ~at_end, joins=joins & ~at_end, held=held)
+        for m, s, now, joins, held in _with_own(meetings, s, now, joins, held)
+    ]
 
 
 def at_once(meetings: list[Meeting], a: tuple[int, ...], b: tuple[int, ...]) -> list[Meeting]:
@@ -117,12 +112,16 @@ def at_once(meetings: list[Meeting], a: tuple[int, ...], b: tuple[int, ...]) -> 
     first = rows(jnp.concatenate([impacts, jnp.full_like(s[:1], jnp.inf)]), alike(both)).min(1)
     strikes = first < jnp.inf
     s, fast, hit = jnp.where(strikes, first, s), fast | strikes, hit | strikes
-    together, start = [], 0
+    return [replace(m, s=s, fast=fast, hit=hit) for m, s, fast, hit in _with_own(meetings, s, fast, hit)]
+
+
+def _with_own(meetings: list[Meeting], *values: Array) -> Iterator[tuple]:
+    """Each of the meetings, with its own rows of values over all of them (M, *batch)."""
+    start = 0
     for m in meetings:
         own = slice(start, start + len(m.s))
-        together.append(replace(m, s=s[own], fast=fast[own], hit=hit[own]))
-        start += len(m.s)
-    return together
+        yield (m, *(value[own] for value in values))
+        start = own.stop
 
 
 def hanging_together(on: Array, links: Links) -> Array:

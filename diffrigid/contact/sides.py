@@ -17,7 +17,7 @@ from diffrigid.gathers import rows
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
 from diffrigid.shapes import BOUNDLESS, Capsule, Disc, HalfSpace, HeightField, Sphere, radius
-from diffrigid.state import rotations
+from diffrigid.state import at_place, rotations
 
 if TYPE_CHECKING:
     from diffrigid.world import World
@@ -152,11 +152,7 @@ def candidates_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
 
 
 def _origin(side: Side, at: Placed) -> tuple[Array, Array]:
-    if side.offset is None:
-        return at.x, at.q
-    so = rotations(at.x.shape[0])
-    x = at.x + so.rotate(at.q, side.offset)
-    return x, at.q if side.turn is None else so.compose(at.q, side.turn)
+    return at_place(at.x, at.q, side.offset, side.turn)
 
 
 def relative_velocity(at_a: Placed, arm_a: Array, at_b: Placed, arm_b: Array) -> Array:
