@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_form import with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -58,6 +59,7 @@ def test_a_stack_takes_a_fall(dtype):
     assert speed < 30 * rounding
 
 
+@pytest.mark.slow
 def test_a_house_of_cards_stands():
     """Two cards lean on each other; friction of their feet and of the ridge keeps them up."""
     half, lean = (0.5, 0.02), np.radians(70.0)
@@ -72,6 +74,7 @@ def test_a_house_of_cards_stands():
     assert drift_and_energy(cards, 0.05)[0] > 0.1  # and falls where its feet slip
 
 
+@pytest.mark.slow
 def test_two_blocks_slide_as_one():
     """Closed form: a rider that sticks to a block slows down with it, by mu g, whatever the masses.
 
@@ -90,11 +93,11 @@ def test_two_blocks_slide_as_one():
         end = dr.rollout(world, state, dt=1 / RATE, steps=round(time * RATE)).state
         return jnp.stack([end.x[-1, :, 0] - end.x[0, :, 0], end.v[-1, :, 0]])
 
-    both = jax.jit(jax.jacfwd(lambda p: (end := at_end(p), end), has_aux=True))
+    both = with_slopes(at_end)
     right = {"m": [[0.0], [0.0]], "v": [[time], [1.0]], "mu": [[-0.5 * G * time**2], [-G * time]]}
     for mass, rounding in ((1.3, 1e-12), (1e-3, 1e-9)):
         p = {name: jnp.asarray(value) for name, value in {"m": mass, "v": 3.0, "mu": 0.4}.items()}
-        slopes, got = both(p)
+        got, (slopes,) = both(p)
         expected = [p["v"] * time - 0.5 * p["mu"] * G * time**2], [p["v"] - p["mu"] * G * time]
         np.testing.assert_allclose(got, np.broadcast_to(expected, (2, 2)), rtol=rounding)
         for name, slope in right.items():
@@ -172,13 +175,19 @@ def test_a_box_on_a_box_is_solved_at_any_speed():
 
 
 def test_no_body_is_displaced_further_than_it_flies():
-    """Forces that began at different times all but cancel on a light body between heavy ones: 1 m is not its way."""
-    world, state = dr.scene({"light": dr.Body(dr.Disc(radius=0.1), mass=1e-3, x=(0.0, 1.0), v=(3.0, 0.0))})
+    """Forces that began at different times all but cancel on a light body between heavy ones: 1 m is not its way.
+
+    Nor is 1 rad its turn, unless it spins.
+    """
+    world, state = dr.scene({"light": dr.Body(dr.Disc(radius=0.1), mass=1e-3, x=(0.0, 1.0), v=(3.0, 0.0), w=-2.0)})
     dt = jnp.asarray(1 / 60)
     flight = launch(world, state, None, jnp.zeros(1), dt)
     shifts = jnp.array([[[0.0, 1.0]], [[0.02, 0.0]]])  # [m]; (3 + 5) m/s for a step are 0.13 m
-    for kick, expected in ((1.0, (8 * dt, 0.02)), (0.0, (1.0, 0.02))):
-        for shift, size in zip(shifts, expected, strict=True):
-            moved = shift, jnp.ones((1, 1))
-            there = _no_further_than_flown(flight, dt[None], jnp.array([[0.0, 4.0]]), moved, jnp.asarray(kick))
-            assert_allclose(there[0], size * shift / jnp.linalg.norm(shift))
+    by = jnp.array([[0.0, 4.0]]), jnp.array([[5.0]])  # [m/s], [rad/s]: it spins with -2 and 3, 0.08 rad in a step
+    free = jnp.array([True])
+    for kick, ways, turns in ((1.0, (8 * dt, 0.02), (5 * dt, 0.07)), (0.0, (1.0, 0.02), (1.0, 0.07))):
+        for shift, way, turn, angle in zip(shifts, ways, turns, (1.0, 0.07), strict=True):
+            moved = shift, jnp.full((1, 1), angle)
+            there = _no_further_than_flown(flight, dt[None], state.q, by, moved, jnp.asarray(kick), free)
+            assert_allclose(there[0], way * shift / jnp.linalg.norm(shift))
+            assert_allclose(there[1], [[turn]])
