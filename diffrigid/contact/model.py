@@ -187,6 +187,7 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
         unused = skips | (push & ~opened)
         strikes = replace(strikes, active=strikes.active & ~skips[None])
 
+    @saving(FOUND)
     def strike(anchors, known):
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         applied = functools.partial(apply_impulses, world, anchors, flight, strikes, law, kick, held_for)
