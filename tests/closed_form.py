@@ -42,18 +42,41 @@ def vector(*components):
     return jnp.stack([jnp.asarray(c, float) for c in components])
 
 
-def with_slopes(fn, derivative=jax.jacfwd):
-    """A function that returns `fn` and its slopes by all arguments, from one program."""
+def units(tree):
+    """For each number of a tree of arrays the tree that is 1 there, and 0 elsewhere."""
+    leaves, structure = jax.tree.flatten(tree)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    for row in np.eye(ends[-1]):
+        parts = zip(np.split(row, ends[:-1]), leaves, strict=True)
+        yield structure.unflatten([part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in parts])
 
-    def twice(*args):
-        value = fn(*args)
-        return value, value
+
+def with_slopes(fn, derivative=jax.jacfwd):
+    """A program of `fn` and its slopes by all arguments.
+
+    In forward mode it has one column of them and is run for each, which compiles sooner than all columns at once.
+    """
 
     def both(*args):
-        slopes, value = derivative(twice, tuple(range(len(args))), has_aux=True)(*args)
+        slopes, value = derivative(lambda *args: (fn(*args),) * 2, tuple(range(len(args))), has_aux=True)(*args)
         return value, slopes
 
-    return both
+    along = jax.jit(lambda args, way: jax.jvp(fn, args, way))
+
+    def column_by_column(*args):
+        args = jax.tree.map(jnp.asarray, args)
+        runs = [along(args, unit) for unit in units(args)]
+        leaves, structure = jax.tree.flatten(args)
+        ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
+
+        def by_argument(*columns):
+            parts = np.split(np.stack(columns, -1), ends, -1)
+            shaped = (part.reshape(part.shape[:-1] + leaf.shape) for part, leaf in zip(parts, leaves, strict=True))
+            return structure.unflatten(shaped)
+
+        return runs[0][0], jax.tree.map(by_argument, *(columns for _, columns in runs))
+
+    return column_by_column if derivative is jax.jacfwd else jax.jit(both)
 
 
 def floats(parameters):
@@ -65,24 +88,32 @@ def floats(parameters):
 
 @jax.jit
 def several_steps(world, state, tangents, dt):
-    """State after BLOCK steps, and its derivatives along K directions, a leading axis of `tangents`."""
+    """State after BLOCK steps, and its derivative along one direction."""
 
     def end(world, state):
         return jax.tree.map(lambda rows: rows[-1], dr.rollout(world, state, dt=dt, steps=BLOCK).state)
 
-    def push(tangent):
-        return jax.jvp(end, (world, state), tangent)
-
-    return jax.vmap(push, out_axes=(None, 0))(tangents)
+    return jax.jvp(end, (world, state), tangents)
 
 
-def final(world, state, dt, blocks):
-    """State after `blocks` rollouts in a row, flat, and its Jacobian by all float leaves of (world, state), flat."""
-    leaves, unravel = ravel_pytree((world, state))
-    by_world, by_state = jax.vmap(unravel)(jnp.eye(len(leaves), dtype=leaves.dtype))
-    for _ in range(blocks):
-        state, by_state = several_steps(world, state, (by_world, by_state), dt)
-    return ravel_pytree(state)[0], jax.vmap(lambda row: ravel_pytree(row)[0])(by_state).T
+def flat(tree):
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+
+
+def final(world, state, dt, blocks, ways=None):
+    """State after `blocks` rollouts in a row, flat, and its Jacobian.
+
+    Args:
+        ways: (leaves, K) directions, of all float leaves of (world, state), flat; None: along each leaf by itself.
+    """
+    pair, (leaves, unravel) = (world, state), ravel_pytree((world, state))
+    columns = []
+    for way in units(pair) if ways is None else map(unravel, ways.T.astype(leaves.dtype)):
+        state, (by_world, by_state) = pair[1], way
+        for _ in range(blocks):
+            state, by_state = several_steps(world, state, (by_world, by_state), dt)
+        columns.append(flat(by_state))
+    return flat(state), np.stack(columns, 1)
 
 
 @partial(jax.jit, static_argnames="steps")
@@ -124,8 +155,7 @@ def simulated(make, parameters, t, rate):
     """Flat state at t and its Jacobian by the parameters, (outputs, parameters)."""
     world, state, by_parameter = build(make, parameters)
     blocks, dt = steps_near(t, rate)
-    end, by_leaf = final(world, state, dt, blocks)
-    return end, by_leaf @ by_parameter
+    return final(world, state, dt, blocks, by_parameter)
 
 
 def exact(case):

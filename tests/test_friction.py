@@ -80,7 +80,8 @@ def on_tiles(up, normal, slope, v):
     return {"block": body, "left": next(tiles), "right": next(tiles)}, []
 
 
-@pytest.mark.parametrize("made", [welded, pytest.param(on_tiles, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("made", [welded, on_tiles])
 def test_what_slides_as_one(made):
     """Two boxes that are welded, or one on two floors: up a slope, over the gap, to a stop within a step, and back."""
 
@@ -91,7 +92,7 @@ def test_what_slides_as_one(made):
         x = dr.rollout(world, state, dt=1 / 60, steps=30).state.x
         return (x[-1, 0] - x[0, 0]) @ up
 
-    value_and_slopes = jax.jit(with_slopes(end))
+    value_and_slopes = with_slopes(end)
     for case in ((0.3, 1.0, 0.0), (0.1, 1.0, 0.2)):
         p, t = tuple(map(jnp.asarray, case)), jnp.asarray(0.5)
         x, slopes = value_and_slopes(*p)
@@ -115,7 +116,7 @@ def test_block_on_a_slope_in_space():
         return dr.rollout(world, state, dt=1 / 60, steps=30).state.x[-1, 0] @ up
 
     p = tuple(map(jnp.asarray, (0.3, 1.3, 0.5)))
-    distance, slopes = jax.jit(with_slopes(motion))(*p)
+    distance, slopes = with_slopes(motion)(*p)
     expected, true_slopes = with_slopes(lambda mu, v, slope: block_in_closed_form(mu, v, slope, 0.5))(*p)
     assert_allclose(distance, expected, atol=1e-9)
     assert_allclose(slopes, true_slopes, atol=1e-5)
@@ -142,11 +143,12 @@ def test_a_box_that_spins_flat_on_a_floor():
         return jnp.stack([w * moves - 0.5 * brake * moves**2, rest, rest, w - brake * moves, rest, rest], axis=1)
 
     p = jnp.asarray(0.2), jnp.asarray(6.0)
-    end, slopes = jax.jit(with_slopes(motion))(*p)
+    end, slopes = with_slopes(motion)(*p)
     assert_allclose(end, expected(*p), atol=1e-9)
     assert_allclose(slopes, jax.jacfwd(expected, (0, 1))(*p), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_top_that_turns_stands_on_its_point():
     """A hull that stands on a vertex with much friction, spins and precesses: the point stays, to second order."""
     rim = [(0.3 * np.cos(t), 0.3 * np.sin(t), 0.5) for t in np.arange(3) * 2.0 * np.pi / 3.0]
@@ -166,7 +168,6 @@ def test_a_top_that_turns_stands_on_its_point():
     assert slid(240) < 3e-4 and slid(960) < 0.1 * slid(240)
 
 
-@jax.jit
 @with_slopes
 def thrown(mu, v, t):
     """Place, speed and spin of a disc after t, 60 steps."""
@@ -204,7 +205,7 @@ def test_cradle_of_touching_balls(rounding):
     assert_allclose(end.x[-1, :, 0], [0.0, 1.0, 2.0, 3.0, 6.0, -1.0], atol=1e-8)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
 @pytest.mark.parametrize("tilt", [2e-4, 1e-3])
 def test_a_cube_tilted_by_little_falls_flat(tilt, dtype):
     """About its lower edge, faster and faster at 3 g / 8 h, within the first step of 1/240 s or the second."""
@@ -262,7 +263,7 @@ def runge_kutta(rate, y, t, steps=2000):
 
 def test_a_box_tips_over_its_corner():
     """With the corner at rest, and sliding without friction: of second order in the step, and so are the slopes."""
-    way = jax.jit(with_slopes(tipping))
+    way = with_slopes(tipping)
     for mu, value, slope in ((0.0, 3e-5, 3e-3), (100.0, 5e-6, 5e-5)):
         p = tuple(map(jnp.asarray, (mu, 0.5, 0.04)))
         motion, slopes = way(*p)
@@ -283,7 +284,7 @@ def rocking(half, mu, e, angle, w):
     return 0.5 * (end.v @ end.v + inertia * end.w[0] ** 2) + G * end.x[1]
 
 
-rocking_with_slopes = jax.jit(with_slopes(rocking))
+rocking_with_slopes = with_slopes(rocking)
 
 
 def rocking_in_theory(half, mu, e, angle, w):
@@ -309,6 +310,7 @@ def test_a_box_rocks_from_corner_to_corner(half, mu, e, atol):
         assert_allclose(slope, expected, rtol=0.0, atol=bound)
 
 
+@pytest.mark.slow
 def test_what_has_landed_flat_has_no_slope():
     """A gap that rounding opens is as closed as one that it does not."""
 
@@ -343,11 +345,12 @@ def over_a_dome_in_theory(shape, mu, start, radius):
     return jnp.stack([angle, w * (0.1 + radius)])
 
 
-@pytest.mark.parametrize("shape, rolling", [pytest.param(dr.Disc, 2e-5, marks=pytest.mark.slow), (dr.Sphere, 4e-5)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shape, rolling", [(dr.Disc, 2e-5), (dr.Sphere, 4e-5)])
 def test_what_is_round_slides_and_rolls_over_a_dome(shape, rolling):
     """The normal turns: of second order in the step, and so are the slopes."""
     motion, theory = partial(over_a_dome, shape), partial(over_a_dome_in_theory, shape)
-    way = jax.jit(with_slopes(motion))
+    way = with_slopes(motion)
     for mu, value, slope in ((0.0, 4e-5, 1e-4), (100.0, rolling, 1e-4)):
         p = tuple(map(jnp.asarray, (mu, 0.2, 1.0)))
         end, slopes = way(*p)
@@ -376,10 +379,10 @@ def on_a_rod_in_closed_form(start, om, u):
 def test_a_side_that_turns_presses_without_any_force():
     """The Coriolis force holds them together: of second order in the step, slopes too."""
     p = tuple(map(jnp.asarray, (-0.3, 6.0, 3.0)))
-    exact, exact_slopes = jax.jit(with_slopes(on_a_rod_in_closed_form))(*p)
+    exact, exact_slopes = with_slopes(on_a_rod_in_closed_form)(*p)
     errors = []
     for steps in (12, 24):
-        place, slopes = jax.jit(with_slopes(partial(on_a_rod_that_turns, steps=steps)))(*p)
+        place, slopes = with_slopes(partial(on_a_rod_that_turns, steps=steps))(*p)
         errors.append(
             [np.abs(place - exact).max(), *(np.abs(a - b).max() for a, b in zip(slopes, exact_slopes, strict=True))]
         )
@@ -400,6 +403,7 @@ def after_a_step_that_missed_it(p):
     return dr.step(world, state, 1 / 240).v
 
 
+@pytest.mark.slow
 def test_what_has_sunk_into_a_side_that_turns_has_the_slope_of_its_repair():
     """It parts, is pressed back, and closes again inside: that impact is not where the gap vanishes."""
     rng, count, h = np.random.default_rng(0), 64, 1e-7
@@ -439,11 +443,12 @@ def slides_into_in_closed_form(p):
     return p["way"] + jnp.array([0.0, 0.2]) + after * jnp.abs(after) / (2 * brake)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_a_block_slides_into_another(mode):
     """They meet within a step: places and slopes of closed form."""
     p = jax.tree.map(jnp.asarray, {"v": 1.6, "m": 0.5, "way": 0.13, "mu": 0.3, "e": 0.6})
-    places, slopes = jax.jit(with_slopes(slides_into, mode))(p)
+    places, slopes = with_slopes(slides_into, mode)(p)
     assert_allclose(places, slides_into_in_closed_form(p), atol=1e-9)
     for name, true_slope in jax.jacfwd(slides_into_in_closed_form)(p).items():
         assert_allclose(slopes[0][name], true_slope, atol=1e-6)  # both stop within a step
@@ -490,7 +495,7 @@ def test_a_ball_that_rests_is_struck():
         world, state = dr.scene(bodies, gravity=(0.0, -9.81), restitution=p[2], friction=p[3])
         return jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(dr.step(world, state, 1 / 120))])
 
-    at, run = jnp.array([0.809, 0.667, 0.7, 0.3]), jax.jit(with_slopes(end))
+    at, run = jnp.array([0.809, 0.667, 0.7, 0.3]), with_slopes(end)
     h = 1e-6 * jnp.eye(4)
     differences = jnp.stack([(run(at + h[k])[0] - run(at - h[k])[0]) / 2e-6 for k in range(4)], axis=1)
     assert float(jnp.abs(differences).max()) > 10.0  # the ball does hit the floor
@@ -510,7 +515,7 @@ GROUNDS = {
 
 
 @pytest.mark.parametrize(
-    "ground", ["box", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tiles", "profile", "slabs"))]
+    "ground", ["tiles", *(pytest.param(name, marks=pytest.mark.slow) for name in ("box", "profile", "slabs"))]
 )
 def test_a_box_slides_past_an_edge_as_over_one_face(ground):
     """Its centre stays over the ground; corners go beyond the edge at any phase of a step. Closed form v - mu g t."""

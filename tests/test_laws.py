@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_form import bouncing, disc_and_plane, final, made, simulated, steps_near, two_discs, vector
+from closed_form import bouncing, disc_and_plane, final, made, simulated, steps_near, two_discs, vector, with_slopes
 from motions import sums
 from numpy.testing import assert_allclose
 
@@ -299,13 +299,12 @@ def test_slopes_where_friction_is_lessened():
         return jnp.concatenate([end.v[0], end.w[0]]), gained
 
     p = jax.tree.map(jnp.asarray, {"v": 3.67, "turn": 1.3, "mass": 1.1, "friction": 0.5})
-    run = jax.jit(after)
-    velocities, gained = run(p)
+    run = with_slopes(after)
+    (velocities, gained), (slopes, _) = run(p)
     assert velocities[0] < 3.0  # it was rubbed
     assert abs(gained) < 1e-12  # and neither gained nor lost: some of the friction is left out
-    slopes = jax.jit(jax.jacfwd(lambda p: after(p)[0]))(p)
-    for name, slope in slopes.items():
-        high, low = (run(p | {name: p[name] + h})[0] for h in (1e-6, -1e-6))
+    for name, slope in slopes[0].items():
+        high, low = (run(p | {name: p[name] + h})[0][0] for h in (1e-6, -1e-6))
         assert_allclose(slope, (high - low) / 2e-6, atol=1e-6)
 
 

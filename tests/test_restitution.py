@@ -34,16 +34,11 @@ def drop(dim, h, e, c, **at):
 
 @pytest.mark.parametrize("dim, derivative", [(2, jax.jacrev), pytest.param(3, jax.jacfwd, marks=pytest.mark.slow)])
 def test_bounces_of_several_drops(dim, derivative):
-    """e^2 h with e at the speed of each, for a batch of drops, and slopes by height, restitution and fall-off."""
-
-    def both(height):
-        return jax.vmap(with_slopes(height, derivative))
-
-    h = jnp.array([0.02, 0.3, 1.0, 2.0])
-    e, c = jnp.full_like(h, 0.9), jnp.array([0.0, 0.5, 0.5, 3.0])  # 0 is constant
-    got = jax.jit(both(lambda h, e, c: drop(dim, h, e, c)))(h, e, c)
-    expected = both(lambda h, e, c: restitution_at(e, c, jnp.sqrt(2 * G * h)) ** 2 * h)(h, e, c)
-    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), got, expected)
+    """e^2 h with e at the speed of each, and slopes by height, restitution and fall-off."""
+    got = with_slopes(lambda h, e, c: drop(dim, h, e, c), derivative)
+    expected = with_slopes(lambda h, e, c: restitution_at(e, c, jnp.sqrt(2 * G * h)) ** 2 * h, derivative)
+    for h, c in ((0.02, 0.0), (0.3, 0.5), (1.0, 0.5), (2.0, 3.0)):  # 0 is constant
+        jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), got(h, 0.9, c), expected(h, 0.9, c))
 
 
 @pytest.mark.parametrize("own, of_pair", [((0.4, 1.0), 0.7), ((0.4, None), 0.4), ((None, None), 0.2)])

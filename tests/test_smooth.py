@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_form import PAIR, disc_and_plane, final, made, steps_near, two_boxes, two_discs
+from closed_form import PAIR, disc_and_plane, final, made, steps_near, two_boxes, two_discs, with_slopes
 from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
@@ -152,10 +152,9 @@ def test_a_disc_that_just_misses_a_corner_is_turned_as_by_a_larger_one():
         n = jnp.stack([-jnp.sqrt(R**2 - (r + miss) ** 2), r + miss]) / R
         return jnp.stack([speed, 0.0]) - (1.0 + e) * speed * n[0] * n
 
-    misses = jnp.array([-0.01, 0.005, 0.02])
-    for of in (lambda fn: fn, jax.jacfwd):
-        found, right = (jax.jit(jax.vmap(of(fn)))(misses) for fn in (simulated, expected))
-        assert_allclose(found, right, atol=EXACT)
+    found, right = with_slopes(simulated), with_slopes(expected)
+    for miss in (-0.01, 0.005, 0.02):
+        jax.tree.map(lambda a, b: assert_allclose(a, b, atol=EXACT), found(miss), right(miss))
 
 
 BOX = dict(shape=dr.Box(half=(0.2, 0.15)), y=0.36, angle=0.6)
@@ -177,7 +176,9 @@ def passed(since, kind, width):
     return jnp.concatenate([end.v, end.w], axis=1)
 
 
-@pytest.mark.parametrize("kind", ["disc and box", "two capsules", pytest.param("two boxes", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["disc and box", *(pytest.param(name, marks=pytest.mark.slow) for name in ("two capsules", "two boxes"))]
+)
 def test_the_phase_of_the_step_does_not_matter(kind):
     """What is struck and how does not depend on where on their paths steps begin, nor do its slopes."""
 

@@ -51,7 +51,7 @@ def turned(scene, seconds, body=0):
 def check_with_slopes(got, expected, arguments, derivative=jax.jacfwd, atol=EXACT):
     """Two functions of the same numbers, and their slopes, compiled at once."""
     numbers, which = tuple(map(jnp.asarray, arguments)), tuple(range(len(arguments)))
-    value, slopes = jax.jit(with_slopes(got, derivative))(*numbers)
+    value, slopes = with_slopes(got, derivative)(*numbers)
     assert_allclose(value, expected(*numbers), atol=atol)
     assert_allclose(slopes, jax.jacfwd(expected, which)(*numbers), atol=atol)
 
@@ -76,7 +76,6 @@ def test_a_limit_of_a_joint_that_does_not_rub_is_struck_at_its_time():
     )
 
 
-@jax.jit
 @with_slopes
 def after_two_seconds(w, upper, e, torque):
     return turned(wheel(w, upper=upper, restitution=e, friction=torque), 2.0)[0]
@@ -128,7 +127,7 @@ def test_damping_slows_what_friction_leaves():
 
 def test_a_damping_that_no_step_resolves_stops_the_joint():
     """It acts within a thousandth of a step: an explicit integration would throw the wheel about, without bound."""
-    value, slope = jax.jit(with_slopes(lambda damping: turned(wheel(1.7, damping=damping), 1.0)[:2]))(jnp.asarray(3e4))
+    value, slope = with_slopes(lambda damping: turned(wheel(1.7, damping=damping), 1.0)[:2])(jnp.asarray(3e4))
     assert abs(value[1]) < 1e-9 and abs(value[0]) < 2 * 1.7 / RATE
     assert np.isfinite(np.asarray(slope)).all()
 
@@ -175,6 +174,7 @@ def test_a_slider_between_elastic_stops_keeps_its_energy(metre):
     assert_allclose(path.x[:, 0, 0] / metre, 0.5 - np.abs(way % 1.0 - 0.5) - 0.2, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [100.0, 120.0, 170.0])
 def test_what_rests_on_the_stop_of_what_rests_on_its_stop(angle):
     """Two links: where both fall freely the second leaves its stop, as it turns more slowly, or goes through it."""
@@ -193,6 +193,7 @@ def test_what_rests_on_the_stop_of_what_rests_on_its_stop(angle):
     assert_allclose(states.w, 0.0, atol=3e-4)
 
 
+@pytest.mark.slow
 def test_a_limit_that_the_floor_presses_shut_stays_shut():
     """Two rods on a hinge fall on a smooth floor as a tent, and open until the hinge lets them no further."""
     c, rod = np.sqrt(0.5), dr.Box(half=(0.5, 0.02))
@@ -231,6 +232,7 @@ def test_a_stiff_hinge_carries_a_load_that_stands_on_it():
     assert float(let_go.max()) < -1e-3
 
 
+@pytest.mark.slow
 def test_a_batch_in_single_precision():
     """Wheels of many speeds, of which some are thrown back by their limit."""
     world, state = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), wheel(1.7, upper=1.0, restitution=0.6))
@@ -283,6 +285,7 @@ def test_limits_may_lie_beyond_half_a_turn(dim):
     assert_allclose(jnp.abs(far), 12.0 if dim == 2 else 4 * np.pi - 12.0, atol=1e-7 if dim == 2 else 1e-6)
 
 
+@pytest.mark.slow
 def test_friction_of_a_slider_keeps_the_spin_of_its_rod():
     """A bead rubs on a rod that turns freely: its friction acts along the rod of the middle of each step."""
     mass, inertia, rub = 0.5, 0.21, 0.15
@@ -320,11 +323,12 @@ def test_friction_turns_back_with_the_motion():
         return (-1.0) ** half * swing
 
     p = tuple(map(jnp.asarray, (40.0, 2.0, 1.0)))
-    value, slopes = jax.jit(with_slopes(place))(*p)
+    value, slopes = with_slopes(place)(*p)
     assert_allclose(value, expected(*p), atol=5e-5)
     assert_allclose(slopes, jax.grad(expected, (0, 1, 2))(*p), atol=5e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.0, 50.0])
 def test_what_a_joint_of_a_linkage_does_acts_in_the_middle_of_a_step(speed):
     """The friction, or a motor, of the second hinge of a swinging chain, beside the same moment as a `Torque`.
