@@ -47,7 +47,7 @@ from diffrigid.contact.sums import at_colliders
 from diffrigid.contact.supported import find_supported, matters
 from diffrigid.flight import Flight, state_at
 from diffrigid.gathers import flags
-from diffrigid.numerics import FOUND, PASSED, dot, safe_divide, saving, with_tangents
+from diffrigid.numerics import FOUND, PASSED, dot, recomputed, safe_divide, saving, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
 
@@ -187,7 +187,6 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
         unused = skips | (push & ~opened)
         strikes = replace(strikes, active=strikes.active & ~skips[None])
 
-    @saving(FOUND)
     def strike(anchors, known):
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         applied = functools.partial(apply_impulses, world, anchors, flight, strikes, law, kick, held_for)
@@ -201,7 +200,7 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
         return choose(reverses, anchors, after), choose(skips, known, following)
 
     any_now = any_world(strikes.active)
-    anchors, known = lax.cond(any_now, strike, lambda *kept: kept, anchors, known)
+    anchors, known = lax.cond(any_now, recomputed(strike, dt), lambda *kept: kept, anchors, known)
     # What comes to rest hid what the same two may do later in the step.
     found = any_now | any_world(impact & resting & ~rested)
     return Progress(anchors, resting, supported, known, found, (resting | strikes.rests).any(0))

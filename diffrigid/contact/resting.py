@@ -12,7 +12,7 @@ from diffrigid.contact.impulse import impulses
 from diffrigid.contact.mobility import Arms, Mobility
 from diffrigid.contact.sums import at_colliders
 from diffrigid.gathers import flags
-from diffrigid.numerics import safe_divide, safe_sqrt, saving
+from diffrigid.numerics import recomputed, safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static
 
 
@@ -79,17 +79,8 @@ def solve_impulses(
     shared = strikes.active & ((others > 1) | flags(joined, count))
     by_itself, alone = strikes.active & ~shared, jnp.zeros_like(strikes.v_rel)
     if not all(joined):
-        alone = lax.cond(
-            any_world(by_itself),
-            saving()(impulses),
-            _none,
-            by_itself,
-            strikes.K,
-            strikes.normal,
-            strikes.v_rel,
-            target,
-            mu,
-        )
+        given = by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu
+        alone = lax.cond(any_world(by_itself), recomputed(impulses, rest_speed), _none, *given)
     cone = Cone(
         on=shared.astype(others.dtype), sharing=jnp.maximum(others, 1.0), scale=_scale(strikes), normal=strikes.normal,
         target=target, mu=mu, most=most, spin=strikes.spin, rest_speed=rest_speed,
