@@ -184,10 +184,10 @@ def test_no_body_is_displaced_further_than_it_flies():
     flight = launch(world, state, None, jnp.zeros(1), dt)
     shifts = jnp.array([[[0.0, 1.0]], [[0.02, 0.0]]])  # [m]; (3 + 5) m/s for a step are 0.13 m
     by = jnp.array([[0.0, 4.0]]), jnp.array([[5.0]])  # [m/s], [rad/s]: it spins with -2 and 3, 0.08 rad in a step
-    free = jnp.array([True])
+    mobility = Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=flight.inverse_inertia)
     for kick, ways, turns in ((1.0, (8 * dt, 0.02), (5 * dt, 0.07)), (0.0, (1.0, 0.02), (1.0, 0.07))):
         for shift, way, turn, angle in zip(shifts, ways, turns, (1.0, 0.07), strict=True):
             moved = shift, jnp.full((1, 1), angle)
-            there = _no_further_than_flown(flight, dt[None], state.q, by, moved, jnp.asarray(kick), free)
+            there = _no_further_than_flown(flight, dt[None], mobility, by, moved, jnp.asarray(kick))
             assert_allclose(there[0], way * shift / jnp.linalg.norm(shift))
             assert_allclose(there[1], [[turn]])

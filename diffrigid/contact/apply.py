@@ -21,7 +21,7 @@ from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
 from diffrigid.contact.sums import side_sum
 from diffrigid.elimination import islands
-from diffrigid.flight import Flight, angular_momentum, angular_velocity, orientation, position, velocity
+from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import flags
 from diffrigid.linkage import Linkage, ends_of, linkage, spread
 from diffrigid.numerics import norm, safe_divide, safe_sqrt
@@ -80,8 +80,7 @@ def apply_impulses(
     # A force that has acted evenly has its centroid in the middle of its time, for which it displaces by P / m.
     displacing = jnp.where(kick > 0, 0.5 * held_for, 1.0)[:, None] * P + early_P
     moved = velocities(mobility, *momentum_changes(strikes, displacing, moving))[:2]
-    free = flags(tuple(i not in mobility.joined for i in range(moving)), t)
-    moved = _no_further_than_flown(flight, t, q, (dv, dw), moved, kick, free)
+    moved = _no_further_than_flown(flight, t, mobility, (dv, dw), moved, kick)
     pushed = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
     kept = _no_faster_than_drift(mobility, pushed, strikes) + keeping_spin(
         strikes, drift_after(strikes, dv), early_P, moving
@@ -95,19 +94,19 @@ def apply_impulses(
 
 
 def _no_further_than_flown(
-    flight: Flight, t: Array, q: Array, by: tuple[Array, Array], moved: tuple[Array, Array], kick: Array, free: Array
+    flight: Flight, t: Array, mobility: Mobility, by: tuple[Array, Array], moved: tuple[Array, Array], kick: Array
 ) -> tuple[Array, Array]:
     """Limit displacements (N, D, *batch) and turns (N, A, *batch) to the time times the speeds before and after.
 
     They are half as large where all forces of a body have acted for one time. Where some have begun later, a light body
-    between heavy ones, on which these forces all but cancel, would be thrown off.
+    between heavy ones, on which these forces all but cancel, would be thrown off. A body with joints turns with its
+    linkage: its turn is limited as its displacement is.
 
     Args:
-        q: orientations at t.
         by: changes of v [m/s] and w [rad/s].
-        free: (N, 1, ...) bool: bodies without joints. What others turn is shared among all bodies of their linkage.
     """
-    before = jax.vmap(velocity)(flight, t), jax.vmap(angular_velocity)(flight, q, t)
+    L = jax.vmap(angular_momentum)(flight, t)
+    before = jax.vmap(velocity)(flight, t), jax.vmap(rotations(flight.dim).apply)(mobility.inverse_inertia, L)
 
     def share(speed: Array, change: Array, way: Array, least: float) -> Array:
         most = (t - flight.t0) * (jax.vmap(norm)(speed) + jax.vmap(norm)(speed + change))
@@ -115,7 +114,8 @@ def _no_further_than_flown(
         return jnp.where((kick > 0) & (size > most + least), safe_divide(most, size), 1.0)[:, None]
 
     of_way, of_turn = (share(*each) for each in zip(before, by, moved, (0.0, LEAST_TURN), strict=True))
-    return of_way * moved[0], jnp.where(free[:, None], of_turn, of_way) * moved[1]
+    joined = flags(tuple(i in mobility.joined for i in range(len(t))), t)[:, None]
+    return of_way * moved[0], jnp.where(joined, of_way, of_turn) * moved[1]
 
 
 def _no_faster_than_drift(mobility: Mobility, dL: Array, strikes: Strikes) -> Array:
