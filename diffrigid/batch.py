@@ -99,7 +99,7 @@ def _batch_last(name: str, value: Any, own: tuple[int, int], count: int) -> Any:
     """Move the batch of a control last, (B, T, D or A) to (T, D or A, B); one that all worlds share stays."""
     array = numbers(f"controls[{name!r}]", value, None)
     if array.shape not in (own, (count, *own)):
-        raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {own} or {(count, *own)}.")
+        raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {own} or {(count, *own)}")
     return array if array.ndim == 2 else jnp.moveaxis(jnp.asarray(array), 0, -1)
 
 

@@ -50,7 +50,7 @@ def as_controls(
     given = controls if isinstance(controls, Mapping) else {}
     for name, size in sizes.items():
         if name not in given:
-            raise ValueError(f"controls has no {name!r}: give controls={{{name!r}: ...}} of shape {(*steps, size)}.")
+            raise ValueError(f"controls has no {name!r}: give controls={{{name!r}: ...}} of shape {(*steps, size)}")
     if not isinstance(controls, Mapping) or any(name not in sizes for name in controls):
         if all(isinstance(force, FORCES) for force in forces):
             unused = [name for name in given if name not in sizes] or [controls]
@@ -66,7 +66,7 @@ def as_controls(
         rest = array.shape[len(whole) :]
         if array.shape[: len(whole)] != whole or (name in sizes and rest not in ((), batch)):
             ending = f" or {(*whole, *batch)}" if batch and name in sizes else ""
-            raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {whole}{ending}.")
+            raise ValueError(f"controls[{name!r}] has shape {array.shape}: expected {whole}{ending}")
         return array.reshape(*whole, *[1] * len(batch)) if name in sizes and not rest else array
 
     def is_whole(node: Any) -> bool:

@@ -50,14 +50,14 @@ def numbers(where: str, value: Any, shape: tuple[int, ...] | None, finite: bool 
     try:
         array = _array(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{where} is {value!r}: expected {expected}.") from error
+        raise ValueError(f"{where} is {value!r}: expected {expected}") from error
     if shape is not None and array.shape != shape:
-        raise ValueError(f"{where} has shape {array.shape}: expected {expected}, without batch axes.")
+        raise ValueError(f"{where} has shape {array.shape}: expected {expected}, without batch axes")
     if finite and not traced(array):
         if not np.isfinite(array).all():
-            raise ValueError(f"{where} is {array}: expected finite numbers; look for a NaN where it was made.")
+            raise ValueError(f"{where} is {array}: expected finite numbers; look for a NaN where it was made")
         if (np.abs(array) > largest(array.dtype)).any():
-            raise ValueError(f"{where} is {array}: too large for {array.dtype}, its cube overflows; use other units.")
+            raise ValueError(f"{where} is {array}: too large for {array.dtype}, its cube overflows; use other units")
     return array
 
 
@@ -82,7 +82,7 @@ def _array(value: Any) -> Numbers:
 def known_number(where: str, value: Any) -> Numbers:
     """Check and convert a number that must not be traced."""
     if traced(value):
-        raise ValueError(f"{where} is traced: expected a number that is known.")
+        raise ValueError(f"{where} is traced: expected a number that is known")
     return numbers(where, value, ())
 
 
@@ -97,10 +97,10 @@ def positive(where: str, value: Any, fix: str) -> Numbers:
     """Check and convert a number above zero."""
     array = numbers(where, value, ())
     if not traced(array) and not array > 0:
-        raise ValueError(f"{where} is {float(array):g}: expected above 0; {fix}.")
+        raise ValueError(f"{where} is {float(array):g}: expected above 0; {fix}")
     if not traced(array) and array < 1 / largest(array.dtype):
         raise ValueError(
-            f"{where} is {float(array):g}: too small for {array.dtype}, its cube vanishes; use other units."
+            f"{where} is {float(array):g}: too small for {array.dtype}, its cube vanishes; use other units"
         )
     return array
 
@@ -109,7 +109,7 @@ def fraction(where: str, value: Any) -> Numbers:
     """Check and convert a coefficient of restitution."""
     array = numbers(where, value, ())
     if not traced(array) and not 0 <= array <= 1:
-        raise ValueError(f"{where} is {float(array):g}: expected 0 (no rebound) to 1 (no loss); clip it.")
+        raise ValueError(f"{where} is {float(array):g}: expected 0 (no rebound) to 1 (no loss); clip it")
     return array
 
 
@@ -117,7 +117,7 @@ def coefficient(where: str, value: Any) -> Numbers:
     """Check and convert a coefficient of friction, or the fall-off of restitution."""
     array = numbers(where, value, ())
     if not traced(array) and not array >= 0:
-        raise ValueError(f"{where} is {float(array):g}: expected 0 or above; drop the sign.")
+        raise ValueError(f"{where} is {float(array):g}: expected 0 or above; drop the sign")
     return array
 
 
@@ -138,7 +138,7 @@ def materials(colliders: Mapping[str, Any], general: Mapping[str, Any]) -> dict[
             values = [rest if value is None else check(f"{name}.{field}", value) for name, value in own.items()]
             found[field] = stack(values), given
         elif field in ("restitution", "friction"):
-            raise ValueError(f"{field} is None: expected a number, 0 for none.")
+            raise ValueError(f"{field} is None: expected a number, 0 for none")
     return found
 
 
@@ -146,9 +146,9 @@ def orientation(name: str, body: Any, dim: int) -> Numbers:
     """Orientation q of a body or static, from its q or angle, (2,) or (4,), of length one."""
     if body.angle is not None:
         if body.q is not None:
-            raise ValueError(f"{name}: got both angle and q; give one of them.")
+            raise ValueError(f"{name}: got both angle and q; give one of them")
         if dim == 3:
-            raise ValueError(f"{name}.angle: expected q = (w, x, y, z), a unit quaternion, in a 3D scene.")
+            raise ValueError(f"{name}.angle: expected q = (w, x, y, z), a unit quaternion, in a 3D scene")
         return known(so2.exp, numbers(f"{name}.angle", body.angle, ())[None])
     unturned = np.eye(rotations(dim).Q)[0]
     q = numbers(f"{name}.q", unturned if body.q is None else body.q, unturned.shape)
@@ -159,7 +159,7 @@ def unit_quaternion(where: str, q: Numbers) -> Numbers:
     """Check q, (2,) or (4,), and scale it to length one to rounding."""
     length = _length(q)
     if not traced(q) and abs(length - 1) > TYPED:
-        raise ValueError(f"{where} has length {length:.6g}: expected 1; divide it by its length.")
+        raise ValueError(f"{where} has length {length:.6g}: expected 1; divide it by its length")
     return q / length
 
 
@@ -190,7 +190,7 @@ def shape_of(where: str, shape: Any, dim: int) -> Any:
     """Convert a shape: float leaves, and the topology of a hull filled in."""
     if dimension(shape) not in (None, dim):
         kind = type(shape).__name__
-        raise ValueError(f"{where} is a {kind} of {dimension(shape)}D: use a shape of {dim}D, as the scene.")
+        raise ValueError(f"{where} is a {kind} of {dimension(shape)}D: use a shape of {dim}D, as the scene")
     shape = map_arrays(lambda leaf, letters, _: _array(leaf), with_topology(shape))
     return replace(shape, normal=shape.normal / _length(shape.normal)) if isinstance(shape, HalfSpace) else shape
 
@@ -203,12 +203,12 @@ def mass_and_inertia(name: str, body: Any, solid: Solid | None, dim: int) -> tup
     of_parts = None if solid is None else solid.mass
     if of_parts is not None and (body.mass is not None or body.density is not None):
         field = "density" if body.mass is None else "mass"
-        raise ValueError(f"{name}.{field}: its parts have masses already; leave it out, or take theirs away.")
+        raise ValueError(f"{name}.{field}: its parts have masses already; leave it out, or take theirs away")
     if of_parts is None and (body.mass is None) == (body.density is None):
         came = "neither" if body.mass is None else "both"
-        raise ValueError(f"{name}: expected either mass [kg] or density, got {came}; give one of them.")
+        raise ValueError(f"{name}: expected either mass [kg] or density, got {came}; give one of them")
     if solid is None and (body.mass is None or body.inertia is None):
-        raise ValueError(f"{name}.shape is None: expected both mass and inertia; give them, or a shape.")
+        raise ValueError(f"{name}.shape is None: expected both mass and inertia; give them, or a shape")
     if of_parts is not None:
         mass = of_parts
     elif body.mass is not None:
@@ -217,14 +217,14 @@ def mass_and_inertia(name: str, body: Any, solid: Solid | None, dim: int) -> tup
         density = positive(f"{name}.density", body.density, "use Static for what does not move")
         mass = density * solid.volume  # type: ignore[union-attr]
         if not traced(solid.volume) and not solid.volume > 0:  # type: ignore[union-attr]
-            raise ValueError(f"{name}.shape has no volume, and so no mass: give mass instead of density.")
+            raise ValueError(f"{name}.shape has no volume, and so no mass: give mass instead of density")
     if body.inertia is not None:
         return mass, _inertia(f"{name}.inertia", body.inertia, dim)
     gyration = solid.gyration  # type: ignore[union-attr]
     if not traced(gyration) and dim == 3:
         low, _, high = np.linalg.eigvalsh(gyration)
         if low <= NO_THICKNESS * high:
-            raise ValueError(f"{name}.shape has no thickness, and so no inertia about its line: give inertia.")
+            raise ValueError(f"{name}.shape has no thickness, and so no inertia about its line: give inertia")
     return mass, mass * gyration
 
 
@@ -237,19 +237,19 @@ def _inertia(where: str, value: Any, dim: int) -> Numbers:
         array = array.reshape(-1, 1) * np.eye(3, dtype=array.dtype)
     if array.shape != (3, 3):
         raise ValueError(
-            f"{where} has shape {array.shape}: expected a number, three principal values, or a (3, 3) matrix."
+            f"{where} has shape {array.shape}: expected a number, three principal values, or a (3, 3) matrix"
         )
     if traced(array):
         return array
     low, middle, high = np.linalg.eigvalsh(array)
     text = f"{where} has principal values {low:.4g}, {middle:.4g}, {high:.4g}"
     if not np.allclose(array, array.T, rtol=TYPED, atol=TYPED * abs(high)):
-        raise ValueError(f"{where} is not symmetric: expected I = I^T; average it with its transpose.")
+        raise ValueError(f"{where} is not symmetric: expected I = I^T; average it with its transpose")
     if low <= 0:
-        raise ValueError(f"{text}: expected all above 0; check signs, products of inertia enter negative.")
+        raise ValueError(f"{text}: expected all above 0; check signs, products of inertia enter negative")
     if high > (low + middle) * (1 + TYPED):
         raise ValueError(
             f"{text}: expected none larger than the sum of the others (triangle inequality), "
-            "as for any distribution of mass; check the order and the units."
+            "as for any distribution of mass; check the order and the units"
         )
     return array

@@ -41,7 +41,7 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
         shape, second = (one, other) if (type(one[0]), type(other[0])) in COLLIDERS else (other, one)
         find = COLLIDERS.get((type(shape[0]), type(second[0])))
         if find is None:
-            raise ValueError(f"gap: {a!r} and {b!r} are half-spaces, which have no distance: name a body for one.")
+            raise ValueError(f"gap: {a!r} and {b!r} are half-spaces, which have no distance: name a body for one")
         gaps.append(find(*shape, *second).gap.min(0))
     return functools.reduce(lambda least, gap: jnp.minimum(least, gap), gaps)
 

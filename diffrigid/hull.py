@@ -48,7 +48,7 @@ def _corners(vertices: Any) -> np.ndarray:
     """Concrete vertices of one hull, (V, 3) in double precision."""
     corners = np.asarray(vertices, float)
     if corners.ndim != 2 or corners.shape[1] != 3:
-        raise ValueError(f"hull vertices have shape {corners.shape}: expected (V, 3), one hull without batch.")
+        raise ValueError(f"hull vertices have shape {corners.shape}: expected (V, 3), one hull without batch")
     return corners
 
 
@@ -143,5 +143,5 @@ def triples(faces: Any) -> tuple[Triple, ...]:
     except ValueError:
         rows = np.zeros(0)
     if rows.ndim != 2 or rows.shape[1] != 3 or rows.dtype.kind not in "iu":
-        raise ValueError(f"Hull.faces is {faces!r}: expected triples of indices of vertices; leave it out.")
+        raise ValueError(f"Hull.faces is {faces!r}: expected triples of indices of vertices; leave it out")
     return tuple(tuple(row) for row in rows.tolist())

@@ -40,18 +40,18 @@ def joints_of(
     for name, joint in joints.items():
         if not isinstance(joint, JOINTS):
             known_kinds = ", ".join(kind.__name__ for kind in JOINTS)
-            raise ValueError(f"joints: {name!r} is {joint!r}: expected one of {known_kinds}.")
+            raise ValueError(f"joints: {name!r} is {joint!r}: expected one of {known_kinds}")
         refuse_missing(joint, name)
         for side in ("a", "b"):
             body = getattr(joint, side)
             if side == "a" and body is None:
-                raise ValueError(f"{name}.a is None: expected a body; name it first, and None, for the world, second.")
+                raise ValueError(f"{name}.a is None: expected a body; name it first, and None, for the world, second")
             if body is not None and (not isinstance(body, str) or body not in colliders):
                 raise ValueError(f"{name}.{side} is {body!r}, which is not a body: {nearest(body, colliders)}")
         if joint.a not in moving and joint.b not in moving:
-            raise ValueError(f"{name} joins {joint.a!r} to {joint.b!r}: expected one that moves; name a Body.")
+            raise ValueError(f"{name} joins {joint.a!r} to {joint.b!r}: expected one that moves; name a Body")
         if joint.a == joint.b:
-            raise ValueError(f"{name} joins {joint.a!r} to itself: expected two bodies.")
+            raise ValueError(f"{name} joins {joint.a!r} to itself: expected two bodies")
         filled = _filled(name, joint, colliders, x, q, dim)
         groups.setdefault(jax.tree.structure(replace(filled, a=None, b=None)), []).append((name, filled))
     records, names = [], []
@@ -74,14 +74,14 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
     if dim == 2:
         fields = [field for field in fields if field != "axis_a" and not (field == "axis_b" and "axis_a" in fields)]
     elif "axis_a" in fields and joint.axis_a is None:
-        raise ValueError(f"{name}.axis_a is missing: expected the axis of the hinge in the axes of {joint.a!r}, (3,).")
+        raise ValueError(f"{name}.axis_a is missing: expected the axis of the hinge in the axes of {joint.a!r}, (3,)")
     given = _given(name, joint, fields, dim)
     filled = replace(joint, **given, **_from_start(so, fields, given, a, b), **ends)
     error = known(lambda joint, a, b: joint(so, a, b), filled, a, b)
     if not traced(error) and (np.abs(error) > _allowed(filled, so, a, b, joint.b is None, len(error))).any():
         raise ValueError(
             f"{name} does not hold at the start: it is off by {np.linalg.norm(error):.3g} (m, rad); move a body, or "
-            "leave out what belongs to b, which is then taken from the start."
+            "leave out what belongs to b, which is then taken from the start"
         )
     _check_drive(name, filled, so, a, b)
     return filled
@@ -141,27 +141,27 @@ def _check_drive(name: str, joint: Any, so: Any, a: Pose, b: Pose) -> None:
     lower, upper = number.get("lower", -np.inf), number.get("upper", np.inf)
     if not lower < upper:
         fix = "use a Weld" if lower == upper else "swap them"
-        raise ValueError(f"{name}.lower is {lower:g} and upper {upper:g}: expected lower < upper; {fix}.")
+        raise ValueError(f"{name}.lower is {lower:g} and upper {upper:g}: expected lower < upper; {fix}")
     if isinstance(joint, Revolute) and 2.0 * np.pi <= upper - lower < np.inf:
         raise ValueError(
-            f"{name} has limits from {lower:g} to {upper:g} rad: expected less than a turn; leave them out, or one."
+            f"{name} has limits from {lower:g} to {upper:g} rad: expected less than a turn; leave them out, or one"
         )
     for field in ("friction", "damping"):
         if number.get(field, 0.0) < 0:
-            raise ValueError(f"{name}.{field} is {number[field]:g}: expected 0 or above; 0 turns it off.")
+            raise ValueError(f"{name}.{field} is {number[field]:g}: expected 0 or above; 0 turns it off")
     if not 0.0 <= number.get("restitution", 0.0) <= 1.0:
-        raise ValueError(f"{name}.restitution is {number['restitution']:g}: expected a number from 0 to 1.")
+        raise ValueError(f"{name}.restitution is {number['restitution']:g}: expected a number from 0 to 1")
     if "speed" in number and given["friction"] is None:
-        raise ValueError(f"{name}.speed needs friction, the most that the motor can do: give friction.")
+        raise ValueError(f"{name}.speed needs friction, the most that the motor can do: give friction")
     if "restitution" in number and given["lower"] is None and given["upper"] is None:
-        raise ValueError(f"{name}.restitution is that at its limits, and it has none: give lower or upper.")
+        raise ValueError(f"{name}.restitution is that at its limits, and it has none: give lower or upper")
     if {"lower", "upper"} & set(number):
         at: Any = known(lambda joint, a, b: joint.coordinate(so, a, b), joint, a, b)
         if isinstance(joint, Revolute) and not traced(at):
             rest = np.remainder(at + np.pi, 2 * np.pi) - np.pi
             at = np.where(np.abs(rest) < TYPED, 0.0, at)  # an angle is known up to full turns; this one was meant as 0
         if not traced(at) and not lower - TYPED <= at <= upper + TYPED:
-            raise ValueError(f"{name} starts at {float(at):g}, outside its limits {lower:g} to {upper:g}: move a body.")
+            raise ValueError(f"{name} starts at {float(at):g}, outside its limits {lower:g} to {upper:g}: move a body")
 
 
 def warn_of_torn_joints(world: "World", state: State) -> None:
@@ -187,7 +187,7 @@ def warn_of_torn_joints(world: "World", state: State) -> None:
         if speed > most:
             warnings.warn(
                 f"{name}: velocities at the start do not fit, the joint comes apart at {speed:.3g} m/s or rad/s; the "
-                "motion begins with the impulse that mends it. Give the bodies v and w that fit.",
+                "motion begins with the impulse that mends it; give the bodies v and w that fit",
                 stacklevel=3,
             )
 
@@ -197,5 +197,5 @@ def _unit(where: str, axis: Any) -> Any:
         return axis
     size = np.linalg.norm(axis)
     if size == 0:
-        raise ValueError(f"{where} has no length: expected a direction.")
+        raise ValueError(f"{where} has no length: expected a direction")
     return axis / size

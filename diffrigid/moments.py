@@ -22,7 +22,7 @@ def volume_properties(shape: Shape, dim: int) -> tuple[Array, Array, Array]:
     """
     if dimension(shape) not in (None, dim):
         name = type(shape).__name__
-        raise ValueError(f"this {name} is {dimension(shape)}D but dim is {dim}: use a shape of {dim}D.")
+        raise ValueError(f"this {name} is {dimension(shape)}D but dim is {dim}: use a shape of {dim}D")
     volume, center, second = _moments(shape, dim)
     return volume, center, _gyration(second, dim)
 
@@ -76,7 +76,7 @@ def _moments(shape, dim):
             return _solid_moments(floats(shape.vertices), np.stack([start, np.roll(start, -1)], axis=1))
         case Hull():
             return _solid_moments(floats(shape.vertices), np.array(with_topology(shape).faces))
-    raise ValueError(f"{type(shape).__name__} has no finite mass: make it Static, or give the body a thick Box.")
+    raise ValueError(f"{type(shape).__name__} has no finite mass: make it Static, or give the body a thick Box")
 
 
 def _centred(volume, spread):

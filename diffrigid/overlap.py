@@ -94,7 +94,7 @@ def warn_of_overlap(world: World, state: State) -> None:
         names = world.names + world.static_names
         both = sorted({(min(i[0], j[0]), max(i[0], j[0])) for i, j in deep})
         text = ", ".join(f"{names[i]} and {names[j]}" for i, j in both)
-        warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore.", stacklevel=3)
+        warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore", stacklevel=3)
 
 
 def outlines(world: World, state: State) -> dict[tuple[int, int, int], Outline]:

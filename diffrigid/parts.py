@@ -55,17 +55,17 @@ def check_shapes(name: str, shape: Any) -> None:
     """Raise ValueError if a body, or a static, cannot have this shape or these parts."""
     several = isinstance(shape, Mapping)
     if isinstance(shape, Part):
-        raise ValueError(f"{name}.shape is a Part: expected a shape, or parts by name, {{'head': Part(...)}}.")
+        raise ValueError(f"{name}.shape is a Part: expected a shape, or parts by name, {{'head': Part(...)}}")
     if several and not shape:
-        raise ValueError(f"{name}.shape is empty: expected parts by name, {{'head': Part(...)}}, or None.")
+        raise ValueError(f"{name}.shape is empty: expected parts by name, {{'head': Part(...)}}, or None")
     for key in shape if several else ():
         if not isinstance(key, str) or not key or "." in key:
-            raise ValueError(f"{name}.shape: {key!r} is not a name: expected a string without dots; rename the part.")
+            raise ValueError(f"{name}.shape: {key!r} is not a name: expected a string without dots; rename the part")
     for path, part in _by_path(name, shape).items():
         check_shape(part.shape, path)
         if several and isinstance(part.shape, BOUNDLESS):
             kind = type(part.shape).__name__
-            raise ValueError(f"{path} is a {kind}, which has no mass: make it a Static of its own.")
+            raise ValueError(f"{path} is a {kind}, which has no mass: make it a Static of its own")
 
 
 def _by_path(name: str, shape: Any) -> dict[str, Part]:
@@ -106,7 +106,7 @@ def solid_of(name: str, body: Any, pieces: Sequence[Piece], dim: int) -> Solid |
         if not pieces or not pieces[0].name or body.inertia is None:
             raise ValueError(
                 f"{name}.center: expected parts, in whose axes it is, and an inertia about it: give "
-                "shape={'ball': Part(...)} and inertia, or leave center out."
+                "shape={'ball': Part(...)} and inertia, or leave center out"
             )
         center = numbers(f"{name}.center", body.center, (dim,))
         return _solid(name, pieces, dim)._replace(center=center)
@@ -114,7 +114,7 @@ def solid_of(name: str, body: Any, pieces: Sequence[Piece], dim: int) -> Solid |
         return None
     solid = _solid(name, pieces, dim)
     if pieces[0].name and solid.mass is None and not traced(solid.volume) and not solid.volume > 0:
-        raise ValueError(f"{name}.shape: its parts have no volume to share the mass by: give each part a mass.")
+        raise ValueError(f"{name}.shape: its parts have no volume to share the mass by: give each part a mass")
     return solid
 
 
@@ -125,7 +125,7 @@ def _solid(name: str, pieces: Sequence[Piece], dim: int) -> Solid:
     given = [piece.mass for piece in pieces if piece.mass is not None]
     if given and len(given) < len(pieces):
         none = next(piece.name for piece in pieces if piece.mass is None)
-        raise ValueError(f"{name}.shape.{none} has no mass, but other parts have: give one to all parts, or to none.")
+        raise ValueError(f"{name}.shape.{none} has no mass, but other parts have: give one to all parts, or to none")
     shapes, x, q = zip(*((piece.shape, piece.x, piece.q) for piece in pieces), strict=True)
     masses = given or None
     volume, center, gyration = known(partial(_assembly_properties, dim=dim), shapes, x, q, masses)

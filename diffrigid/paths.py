@@ -108,7 +108,7 @@ def _solid(world: World, solid: tuple[Seat, ...]) -> tuple[Array, Array]:
 def _item(vector: Array, path: str, index: int) -> Array:
     """Component `index` of a vector; `path` is that of the whole."""
     if not vector.ndim or index >= vector.shape[0]:
-        raise ValueError(f"{path}[{index}] is not a number: {path} has the shape {vector.shape}.")
+        raise ValueError(f"{path}[{index}] is not a number: {path} has the shape {vector.shape}")
     return _row(vector, index)
 
 

@@ -118,7 +118,7 @@ def refuse_missing(record: Any, where: str) -> None:
     """Raise ValueError for a float leaf that is None, unless None is its default."""
     for field in dataclasses.fields(record):
         if "letters" in field.metadata and field.default is not None and getattr(record, field.name) is None:
-            raise ValueError(f"{where}.{field.name} is None: expected numbers.")
+            raise ValueError(f"{where}.{field.name} is None: expected numbers")
 
 
 def undeclared_fields(record: Any) -> list[str]:

@@ -155,7 +155,7 @@ def scene(
     numbers_of_all = restitution, friction, restitution_falloff, rolling_friction, spinning_friction
     material = materials(everything, dict(zip(COEFFICIENTS, numbers_of_all, strict=True)))
     if dim == 2 and "spinning_friction" in material:
-        raise ValueError("spinning_friction: in 2D nothing turns about a normal; give rolling_friction.")
+        raise ValueError("spinning_friction: in 2D nothing turns about a normal; give rolling_friction")
     crowd = is_many(kinds, owners, n, not (named_forces or linked or passing or parts or {*material} & TURNING))
     pairs: tuple = ()
     if not crowd:
@@ -184,26 +184,26 @@ def scene(
 def _sorted(bodies: Mapping[str, Body | Static]) -> tuple[dict[str, Body], dict[str, Static]]:
     """Moving bodies and statics, each in the order given."""
     if not isinstance(bodies, Mapping):
-        raise ValueError(f"bodies is {bodies!r}: expected a dict of names, {{'ball': Body(...)}}.")
+        raise ValueError(f"bodies is {bodies!r}: expected a dict of names, {{'ball': Body(...)}}")
     for name, body in bodies.items():
         if not isinstance(body, Body | Static):
-            raise ValueError(f"bodies[{name!r}] is {body!r}: expected a Body or a Static around the shape.")
+            raise ValueError(f"bodies[{name!r}] is {body!r}: expected a Body or a Static around the shape")
         if not isinstance(name, str) or not name or "." in name or name in (*RESERVED, "gravity"):
             taken = ", ".join((*RESERVED, "gravity"))
-            raise ValueError(f"bodies: {name!r} is not a name: expected a string without dots, not {taken}; rename it.")
+            raise ValueError(f"bodies: {name!r} is not a name: expected a string without dots, not {taken}; rename it")
         if isinstance(body, Static) and body.shape is None:
-            raise ValueError(f"{name}.shape is None: expected a shape; leave out a Static without one.")
+            raise ValueError(f"{name}.shape is None: expected a shape; leave out a Static without one")
         if isinstance(body, Static) and isinstance(body.shape, Mapping):
-            raise ValueError(f"{name}.shape has parts: expected one shape; give each part a Static of its own.")
+            raise ValueError(f"{name}.shape has parts: expected one shape; give each part a Static of its own")
         if isinstance(body, Body) and isinstance(body.shape, BOUNDLESS):
-            raise ValueError(f"{name}.shape is a {type(body.shape).__name__}, which has no mass: make {name} a Static.")
+            raise ValueError(f"{name}.shape is a {type(body.shape).__name__}, which has no mass: make {name} a Static")
         if isinstance(body, Body) and body.x is None:
-            raise ValueError(f"{name}.x is missing: expected the centre of mass, (2,) or (3,) [m]; give x.")
+            raise ValueError(f"{name}.x is missing: expected the centre of mass, (2,) or (3,) [m]; give x")
         if body.shape is not None:
             check_shapes(name, body.shape)
     moving = {name: body for name, body in bodies.items() if isinstance(body, Body)}
     if not moving:
-        raise ValueError(f"bodies has no Body, only {list(bodies)}: expected one that moves; add a Body.")
+        raise ValueError(f"bodies has no Body, only {list(bodies)}: expected one that moves; add a Body")
     return moving, {name: body for name, body in bodies.items() if isinstance(body, Static)}
 
 
@@ -213,14 +213,14 @@ def _listed(ignore: Any) -> list:
             return list(ignore)
     except TypeError:  # also of an array without axes, which has `__iter__`
         pass
-    raise ValueError(f"ignore is {ignore!r}: expected pairs of names, [('arm', 'hand')].")
+    raise ValueError(f"ignore is {ignore!r}: expected pairs of names, [('arm', 'hand')]")
 
 
 def _passing(ignore: Any, names: list[str]) -> set[frozenset[int]]:
     """The pairs of `ignore` as sets of two colliders."""
     for pair in ignore:
         if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise ValueError(f"ignore has {pair!r}: expected pairs of names, [('arm', 'hand')]; add a bracket.")
+            raise ValueError(f"ignore has {pair!r}: expected pairs of names, [('arm', 'hand')]; add a bracket")
         for name in pair:
             if not isinstance(name, str) or name not in names:
                 raise ValueError(f"ignore names {name!r}, which is not a body: {nearest(name, names)}")
@@ -234,14 +234,14 @@ def _dimension(moving: Mapping[str, Body], gravity: Any) -> int:
         sizes[f"{name}.x"] = _length(f"{name}.x", body.x)
         sizes |= dimensions(name, body.shape)
     if len(set(sizes.values())) > 1:
-        raise ValueError(f"a scene is all 2D or all 3D, but got {sizes}: use the same number of components.")
+        raise ValueError(f"a scene is all 2D or all 3D, but got {sizes}: use the same number of components")
     return next(iter(sizes.values()))
 
 
 def _length(where: str, value: Any) -> int:
     array = numbers(where, value, None)
     if array.shape not in ((2,), (3,)):
-        raise ValueError(f"{where} has shape {array.shape}: expected 2 or 3 numbers, one for each axis.")
+        raise ValueError(f"{where} has shape {array.shape}: expected 2 or 3 numbers, one for each axis")
     return len(array)
 
 
@@ -281,18 +281,18 @@ def _joints(joints: Any, named: Mapping, moving: Mapping, still: Mapping, dim: i
 
 def _contact(contact: Any) -> Contact:
     if not isinstance(contact, Contact):
-        raise ValueError(f"contact is {contact!r}: expected a Contact(width=0.0).")
+        raise ValueError(f"contact is {contact!r}: expected a Contact(width=0.0)")
     refuse_missing(contact, "contact")
     for name in ("sweeps", "neighbours"):
         value = getattr(contact, name)
         if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MOST:
-            raise ValueError(f"contact.{name} is {value!r}: expected an integer above 0, up to {MOST}; leave it out.")
+            raise ValueError(f"contact.{name} is {value!r}: expected an integer above 0, up to {MOST}; leave it out")
 
     def check(leaf, letters, path):
         del letters
         array = numbers(path, leaf, ())
         if not traced(array) and array < 0:
-            raise ValueError(f"{path} is {float(array):g}: expected 0 or above; 0 turns it off.")
+            raise ValueError(f"{path} is {float(array):g}: expected 0 or above; 0 turns it off")
         return array
 
     return map_arrays(check, contact, "contact")

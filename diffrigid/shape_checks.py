@@ -32,7 +32,7 @@ def check_shape(shape: Shape, where: str) -> None:
     """
     if not isinstance(shape, SHAPES):
         names = ", ".join(kind.__name__ for kind in SHAPES)
-        raise ValueError(f"{where} is {shape!r}: expected one of {names}.")
+        raise ValueError(f"{where} is {shape!r}: expected one of {names}")
     refuse_missing(shape, where)
 
     def check(leaf, letters, path):
@@ -45,7 +45,7 @@ def check_shape(shape: Shape, where: str) -> None:
     map_arrays(check, shape, where)
     if isinstance(shape, HeightField) and shape.cells is not None:
         if not isinstance(shape.cells, int) or isinstance(shape.cells, bool) or shape.cells < 1:
-            raise ValueError(f"{where}.cells is {shape.cells!r}: expected an integer above 0; leave it out.")
+            raise ValueError(f"{where}.cells is {shape.cells!r}: expected an integer above 0; leave it out")
     if isinstance(shape, Hull) and shape.faces is not None and not traced(shape.vertices):
         if problem := faces_problem(np.asarray(shape.vertices, float), triples(shape.faces)):
             raise ValueError(f"{where}.faces {problem}")
@@ -56,7 +56,7 @@ def _check_axes(leaf, letters, path, dim):
     try:
         shape = numbers(path, leaf, None, finite=False).shape
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path} is {leaf!r}: expected numbers in rows of equal length.") from error
+        raise ValueError(f"{path} is {leaf!r}: expected numbers in rows of equal length") from error
     fits, expected = {
         (): (shape == (), "one number"),
         ("D",): (shape in ((2,), (3,)), "2 or 3 numbers"),
@@ -64,17 +64,17 @@ def _check_axes(leaf, letters, path, dim):
         ("R", "C"): (len(shape) == 2 and min(shape) > 1, "(R, C), both above 1"),
     }[letters]
     if not fits:
-        raise ValueError(f"{path} has shape {shape}: expected {expected}, without batch axes.")
+        raise ValueError(f"{path} has shape {shape}: expected {expected}, without batch axes")
 
 
 def _check_values(shape, value, path, field):
     """Raise ValueError for the first thing that is wrong with the concrete `value` of one leaf."""
     if not np.isfinite(value).all():
-        raise ValueError(f"{path} is not finite ({value}): look for a division by zero where it was made.")
+        raise ValueError(f"{path} is not finite ({value}): look for a division by zero where it was made")
     size = np.abs(value) if value.ndim < 2 else np.ptp(value, axis=0)
     most = largest(value.dtype)
     if (np.abs(value) > most).any() or ((size > 0) & (size < 1 / most)).any() and not isinstance(shape, HalfSpace):
-        raise ValueError(f"{path} is {value} m: its cube leaves the range of {value.dtype}; use other units.")
+        raise ValueError(f"{path} is {value} m: its cube leaves the range of {value.dtype}; use other units")
     rule = _RULES.get((type(shape), field))
     if rule and (problem := rule(value)):
         raise ValueError(f"{path} {problem}")

@@ -30,11 +30,11 @@ def looking_around(pieces: Mapping[str, tuple[Piece, ...]], moving: Iterable[str
         if shape.cells is None and traced(parts):
             raise ValueError(
                 f"{name}.shape.spacing or the size of a body is traced, so how far it looks around cannot be found: "
-                "give the HeightField cells=..., above the largest size of a body over the spacing by 1."
+                "give the HeightField cells=..., above the largest size of a body over the spacing by 1"
             )
         least = None if traced(parts) else int(max(parts, default=1))
         if shape.cells is not None and least is not None and shape.cells < least:
-            raise ValueError(f"{name}.shape.cells is {shape.cells}: expected {least} or more, or leave it out.")
+            raise ValueError(f"{name}.shape.cells is {shape.cells}: expected {least} or more, or leave it out")
         found[name] = (Piece("", replace(shape, cells=least if shape.cells is None else shape.cells)),)
     return found
 

@@ -198,7 +198,7 @@ def vertices(shape: Shape, dim: int) -> Array:
             return jnp.asarray(_box_signs(dim, half.ndim - 1, half.dtype)) * half[None]
         case Polygon() | Hull():
             return floats(shape.vertices)
-    raise ValueError(f"{type(shape).__name__} has no vertices; it needs its own colliders.")
+    raise ValueError(f"{type(shape).__name__} has no vertices; it needs its own colliders")
 
 
 @functools.cache
@@ -268,7 +268,7 @@ def _topology(hull: Hull) -> tuple[tuple, tuple]:
     if hull.faces is None and unknown:
         raise ValueError(
             "Hull.vertices is traced, so its faces cannot be found: outside the traced function make "
-            "hull = with_topology(Hull(vertices=...)), inside it replace(hull, vertices=...)."
+            "hull = with_topology(Hull(vertices=...)), inside it replace(hull, vertices=...)"
         )
     # static fields must hash, and faces may come as an array
     faces = hull_faces(hull.vertices) if hull.faces is None else triples(hull.faces)

@@ -110,23 +110,23 @@ def check_kinds(world: Any, state: Any) -> None:
     if not isinstance(world, World) or not isinstance(state, State):
         raise ValueError(
             f"expected (world, state), got ({type(world).__name__}, {type(state).__name__}): "
-            "both come from `diffrigid.scene`, in this order."
+            "both come from `diffrigid.scene`, in this order"
         )
     refuse_missing(state, "state")
     if world.crowd and not traced(world.contact.width) and np.any(np.asarray(world.contact.width) > 0):
-        raise ValueError(f"contact.width is {world.contact.width}: expected 0 for so many bodies; use fewer.")
+        raise ValueError(f"contact.width is {world.contact.width}: expected 0 for so many bodies; use fewer")
     if world.crowd and (world.forces or world.joints):
-        raise ValueError("world has forces or joints, but was made as a crowd without: give them to `scene`.")
+        raise ValueError("world has forces or joints, but was made as a crowd without: give them to `scene`")
     if not isinstance(world.bodies, Bodies):
-        raise ValueError(f"world.bodies is a {type(world.bodies).__name__}: expected the Bodies that `scene` made.")
+        raise ValueError(f"world.bodies is a {type(world.bodies).__name__}: expected the Bodies that `scene` made")
 
 
 def shape_of_leaf(leaf: Any, path: str) -> tuple[int, ...]:
     """Shape of an array or a number."""
     if not hasattr(leaf, "shape") and not isinstance(leaf, int | float):
-        raise ValueError(f"{path} is a {type(leaf).__name__}: expected an array; convert it with jnp.asarray.")
+        raise ValueError(f"{path} is a {type(leaf).__name__}: expected an array; convert it with jnp.asarray")
     if isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biuf":
-        raise ValueError(f"{path} has type {leaf.dtype}: expected floating point.")
+        raise ValueError(f"{path} has type {leaf.dtype}: expected floating point")
     return leaf.shape if hasattr(leaf, "shape") else ()
 
 
@@ -178,12 +178,12 @@ def check_leaves(world: World, state: State, batch_first: bool = False) -> dict[
             raise ValueError(
                 f"{path} has shape {shape}, expected ({', '.join(axes)}) in this {world.dim}D world of "
                 f"{sizes['N']} bodies: make world and state with the same `scene`, and put batch axes {where}"
-                + ("." if batch_first else " (or use rollout_batch).")
+                + ("" if batch_first else " (or use rollout_batch)")
             )
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             raise ValueError(
                 f"{path} has type {jnp.result_type(leaf)}, expected floating point: convert it with "
-                "jnp.asarray(..., float)."
+                "jnp.asarray(..., float)"
             )
         batches.setdefault(batch, path)
         return leaf
@@ -202,5 +202,5 @@ def _check_batches(batches: dict[tuple[int, ...], str]) -> None:
             (n, first), (m, second), *_ = lengths.items()
             raise ValueError(
                 f"batch axes do not fit: axis {axis} of the batch has length {n} in {first} but {m} in {second}; "
-                "give both the same length, or one of them length 1."
+                "give both the same length, or one of them length 1"
             )

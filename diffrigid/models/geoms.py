@@ -43,13 +43,13 @@ def geometry_of(reader: Reader, R: np.ndarray) -> Made:
         axis = ends[3:] - ends[:3]
         half, radius = float(0.5 * np.linalg.norm(axis)), float(reader.some("size")[0])
         if half == 0:
-            raise ValueError(f"{reader.where}: fromto is {reader.text('fromto')!r}: expected two points.")
+            raise ValueError(f"{reader.where}: fromto is {reader.text('fromto')!r}: expected two points")
         frame = Frame(0.5 * (ends[:3] + ends[3:]), onto(axis))
         size = np.array([radius, radius, half] if SIZES[kind] == 3 else [radius, half])
     else:
         size = reader.some("size")[: SIZES[kind]]
     if len(size) < SIZES[kind] or not (size > 0).all():
-        raise ValueError(f"{reader.where}: size is {reader.text('size')!r}: expected {SIZES[kind]} numbers above 0.")
+        raise ValueError(f"{reader.where}: size is {reader.text('size')!r}: expected {SIZES[kind]} numbers above 0")
     return _solid(kind, frame, size)
 
 
@@ -73,7 +73,7 @@ def mass_of(reader: Reader, made: Made) -> Mass | None:
     """Mass of a geom from its mass or density, in the axes of its body."""
     if made.kind not in SIZES:
         if made.kind != "plane" and reader.text("mass") != "0":
-            raise ValueError(f"{reader.where} is a {made.kind}, whose mass is not known: give the body an inertial.")
+            raise ValueError(f"{reader.where} is a {made.kind}, whose mass is not known: give the body an inertial")
         return None
     mass = reader.number("mass") if reader.given("mass") else reader.number("density", DENSITY) * made.volume
     return Mass(mass, made.frame.x, turned(mass * made.gyration, made.frame.R)) if mass > 0 else None

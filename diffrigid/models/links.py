@@ -126,7 +126,7 @@ def assemble(
             made[name] = _joint(link, frames, skipped)
     if skipped:
         # At the call of `load_mjcf` or `load_urdf`, which `np.errstate` wraps.
-        warnings.warn(f"{where}: left out: {'; '.join(dict.fromkeys(skipped))}.", stacklevel=4)
+        warnings.warn(f"{where}: left out: {'; '.join(dict.fromkeys(skipped))}", stacklevel=4)
     return scene(
         bodies, gravity=gravity, restitution=restitution, contact=contact, joints=made,
         ignore=_ignored(shapes, set(map(frozenset, apart))),
@@ -144,7 +144,7 @@ def free_name(name: str, taken: Any, suffix: str) -> str:
 def _body(where: str, link: Link, skipped: list[str]) -> tuple[Body, Frame, list[Geometry]]:
     """Make a body of a moving link; return its axes in the world, and the shapes that it collides with, too."""
     if link.mass is None or not link.mass.mass > 0:
-        raise ValueError(f"{where}: {link.name!r} moves and has no mass: give it an inertial, or fix it.")
+        raise ValueError(f"{where}: {link.name!r} moves and has no mass: give it an inertial, or fix it")
     mass, chosen = link.mass, []
     for geometry in link.geometry:
         if isinstance(geometry.shape, HalfSpace):

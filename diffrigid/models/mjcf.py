@@ -41,7 +41,7 @@ class Model:
         """Reader of the attributes of an element and of its class."""
         name = element.get("class", scope)
         if name not in self.classes:
-            raise ValueError(f"{self.where}: <{element.tag}> has the class {name!r}, which is not in <default>.")
+            raise ValueError(f"{self.where}: <{element.tag}> has the class {name!r}, which is not in <default>")
         return Reader(self.where, element.tag, {**self.classes[name].get(element.tag, {}), **element.attrib})
 
     def name_of(self, element: ElementTree.Element, default: str) -> str:
@@ -82,10 +82,10 @@ def load_mjcf(path: str | Path, *, restitution: Any = 0.0, contact: Contact | No
     compiler = _merged(where, root, "compiler")
     angle, mode = compiler.word("angle", "degree", "radian"), compiler.word("inertiafromgeom", "auto", "true", "false")
     if compiler.text("coordinate", "local") != "local":
-        raise ValueError(f"{where}: <compiler coordinate='global'> cannot be loaded: expected local coordinates.")
+        raise ValueError(f"{where}: <compiler coordinate='global'> cannot be loaded: expected local coordinates")
     sequence = str(compiler.text("eulerseq", "xyz"))
     if len(sequence) != 3 or not set(sequence.lower()) <= set("xyz"):
-        raise ValueError(f"{compiler.where}: eulerseq is {sequence!r}: expected three letters of x, y, z, X, Y, Z.")
+        raise ValueError(f"{compiler.where}: eulerseq is {sequence!r}: expected three letters of x, y, z, X, Y, Z")
     limited = compiler.word("autolimits", "true", "false") == "true"
     model = Model(where, angle == "degree", sequence, limited, mode, _classes(where, root))
     option = _merged(where, root, "option")
@@ -110,10 +110,10 @@ def _include(root: ElementTree.Element, folder: Path, parents: tuple[Path, ...])
         for place, element in reversed(list(enumerate(parent))):
             if element.tag == "include":
                 if not element.get("file"):
-                    raise ValueError(f"{parents[-1]}: an <include> has no file.")
+                    raise ValueError(f"{parents[-1]}: an <include> has no file")
                 path = (folder / element.get("file", "")).resolve()
                 if path in parents:
-                    raise ValueError(f"{path} includes itself.")
+                    raise ValueError(f"{path} includes itself")
                 inner = read_xml(path, None)
                 _include(inner, folder, (*parents, path))
                 parent.remove(element)
@@ -133,7 +133,7 @@ def _classes(where: str, root: ElementTree.Element) -> dict[str, dict[str, dict[
     def walk(element: ElementTree.Element, outer: dict[str, dict[str, str]], default: str | None) -> None:
         name = element.get("class", default)
         if name is None:
-            raise ValueError(f"{where}: a <default> in another has no class: expected a name.")
+            raise ValueError(f"{where}: a <default> in another has no class: expected a name")
         own = {tag: dict(attributes) for tag, attributes in classes.get(name, outer).items()}
         for child in element:
             if child.tag != "default":
@@ -155,7 +155,7 @@ def _children(model: Model, element: ElementTree.Element, parent: Link, scope: s
     """Read the bodies in an element, and the geoms if it is the world."""
     scope = element.get("childclass", scope)
     if odd := [child.tag for child in element if child.tag in BREAKING]:
-        raise ValueError(f"{model.where}: <{odd[0]}> in {parent.name!r} cannot be loaded: write it out as bodies.")
+        raise ValueError(f"{model.where}: <{odd[0]}> in {parent.name!r} cannot be loaded: write it out as bodies")
     if parent.name == "world":
         geometry = tuple(_geoms(model, element, "world", scope)[0])
         model.links.append(Link("world", Frame(), None, Joint("weld"), None, geometry, still=True))
@@ -184,7 +184,7 @@ def _rotation(model: Model, reader: Reader) -> np.ndarray:
     scale = np.pi / 180.0 if model.degrees else 1.0
     given = [name for name in ("quat", "axisangle", "euler", "xyaxes", "zaxis") if reader.given(name)]
     if len(given) > 1:
-        raise ValueError(f"{reader.where} has {given[0]} and {given[1]}: expected one orientation.")
+        raise ValueError(f"{reader.where} has {given[0]} and {given[1]}: expected one orientation")
     match given:
         case ["quat"]:
             return from_quaternion(_direction(reader, "quat", 4))
@@ -196,7 +196,7 @@ def _rotation(model: Model, reader: Reader) -> np.ndarray:
         case ["xyaxes"]:
             x, y = _not_zero(reader, "xyaxes", reader.numbers("xyaxes", 6).reshape(2, 3).T).T
             if not np.cross(x / np.linalg.norm(x), y / np.linalg.norm(y)).any():
-                raise ValueError(f"{reader.where}: xyaxes is {reader.text('xyaxes')!r}: expected two directions.")
+                raise ValueError(f"{reader.where}: xyaxes is {reader.text('xyaxes')!r}: expected two directions")
             return from_axes(x, y)
         case ["zaxis"]:
             return onto(_direction(reader, "zaxis", 3))
@@ -210,7 +210,7 @@ def _direction(reader: Reader, name: str, count: int, default: Any = None) -> np
 def _not_zero(reader: Reader, name: str, values: np.ndarray) -> np.ndarray:
     """Return a direction, or several as columns, after a check that none is zero."""
     if (np.abs(values).max(0) < 1 / largest(float)).any():
-        raise ValueError(f"{reader.where}: {name} is zero: expected a direction.")
+        raise ValueError(f"{reader.where}: {name} is zero: expected a direction")
     return values
 
 
@@ -261,7 +261,7 @@ def _joint(model: Model, element: ElementTree.Element, name: str, parent: Link, 
     if len(found) > 1:
         raise ValueError(
             f"{model.where}: body {name!r} has {len(found)} joints: expected one; put a body with a small mass between "
-            "each two, or a ball for three hinges in one point."
+            "each two, or a ball for three hinges in one point"
         )
     if found[0].tag == "freejoint":
         kind, reader = "free", Reader(model.where, "freejoint", dict(found[0].attrib))
@@ -269,9 +269,9 @@ def _joint(model: Model, element: ElementTree.Element, name: str, parent: Link, 
         reader = model.reader(found[0], scope)
         kind = str(reader.text("type", "hinge"))
     if kind not in KINDS:
-        raise ValueError(f"{reader.where}: type is {kind!r}: expected one of {', '.join(KINDS)}.")
+        raise ValueError(f"{reader.where}: type is {kind!r}: expected one of {', '.join(KINDS)}")
     if kind == "free" and parent.name != "world":
-        raise ValueError(f"{reader.where} is free, but {name!r} is in {parent.name!r}: expected it in <worldbody>.")
+        raise ValueError(f"{reader.where} is free, but {name!r} is in {parent.name!r}: expected it in <worldbody>")
     joint = _driven(model, reader, kind) if kind in ("hinge", "slide") else Joint(
         kind, str(reader.text("name", "")), reader.numbers("pos", 3, np.zeros(3))
     )  # fmt: skip

@@ -52,12 +52,12 @@ def load_urdf(
     left_out: list[str] = [f"{e.tag}" for e in root if e.tag not in ("link", "joint", *QUIET)]
     elements = {_name(where, link): link for link in root.findall("link")}
     if len(elements) != len(root.findall("link")):
-        raise ValueError(f"{where} has two links of one name.")
+        raise ValueError(f"{where} has two links of one name")
     joints: dict[str, ElementTree.Element] = {}  # by the link that they move
     for joint in root.findall("joint"):
         parent, child = (_end(where, joint, end, elements) for end in ("parent", "child"))
         if child in joints:
-            raise ValueError(f"{where}: link {child!r} is the child of two joints: expected a tree.")
+            raise ValueError(f"{where}: link {child!r} is the child of two joints: expected a tree")
         joints[child] = joint
     links: list[Link] = []
     places: dict[str, tuple[Link, Frame]] = {}  # of each link: the one that it is part of, and where in it
@@ -98,18 +98,18 @@ def _ordered(where: str, elements: dict, joints: dict) -> list[str]:
     """Names of the links, parents first, from the one root."""
     roots = [name for name in elements if name not in joints]
     if len(roots) != 1:
-        raise ValueError(f"{where} has the roots {roots}: expected exactly one link that is not the child of a joint.")
+        raise ValueError(f"{where} has the roots {roots}: expected exactly one link that is not the child of a joint")
     out = [roots[0]]
     for name in out:
         out += [child for child, joint in joints.items() if _end(where, joint, "parent", elements) == name]
     if lost := [name for name in elements if name not in out]:
-        raise ValueError(f"{where}: links {lost} form a loop: expected a tree.")
+        raise ValueError(f"{where}: links {lost} form a loop: expected a tree")
     return out
 
 
 def _name(where: str, element: ElementTree.Element) -> str:
     if not element.get("name"):
-        raise ValueError(f"{where}: a <{element.tag}> has no name.")
+        raise ValueError(f"{where}: a <{element.tag}> has no name")
     return element.attrib["name"]
 
 
@@ -117,7 +117,7 @@ def _end(where: str, joint: ElementTree.Element, end: str, links: Any) -> str:
     found = joint.find(end)
     name = None if found is None else found.get("link")
     if name not in links:
-        raise ValueError(f"{where}: joint {joint.get('name')!r} has the {end} {name!r}: expected a link of the file.")
+        raise ValueError(f"{where}: joint {joint.get('name')!r} has the {end} {name!r}: expected a link of the file")
     return str(name)
 
 
@@ -155,7 +155,7 @@ def _geometry(where: str, name: str, element: ElementTree.Element, friction: flo
         frame, holder = _origin(where, f"collision of {name}", collision), collision.find("geometry")
         solid = None if holder is None or not len(holder) else holder[0]
         if solid is None:
-            raise ValueError(f"{where}: a <collision> of {name!r} has no geometry.")
+            raise ValueError(f"{where}: a <collision> of {name!r} has no geometry")
         reader = Reader(where, f"{solid.tag} of {name}", dict(solid.attrib))
         shape: Any = None
         match solid.tag:
@@ -178,12 +178,12 @@ def _geometry(where: str, name: str, element: ElementTree.Element, friction: flo
 def _joint(where: str, element: ElementTree.Element, left_out: list[str]) -> Joint:
     name, kind = _name(where, element), element.get("type", "")
     if kind not in KINDS:
-        raise ValueError(f"{where}: joint {name!r} has the type {kind!r}: expected one of {', '.join(KINDS)}.")
+        raise ValueError(f"{where}: joint {name!r} has the type {kind!r}: expected one of {', '.join(KINDS)}")
     known = ("origin", "parent", "child", "axis", "limit", "dynamics")
     left_out += [f"{child.tag} of joint {name!r}" for child in element if child.tag not in known]
     axis = _reader(where, name, element, "axis").numbers("xyz", 3, (1.0, 0.0, 0.0))
     if not axis.any():
-        raise ValueError(f"{where}: the axis of joint {name!r} is zero: expected a direction.")
+        raise ValueError(f"{where}: the axis of joint {name!r} is zero: expected a direction")
     limit, dynamics = (_reader(where, name, element, tag) for tag in ("limit", "dynamics"))
     lower = upper = None
     if kind in ("revolute", "prismatic"):

@@ -22,12 +22,12 @@ def read_xml(path: str | Path, root: str | None) -> ElementTree.Element:
     except (ElementTree.ParseError, UnicodeDecodeError, LookupError) as error:
         raise ValueError(f"{path} is not an XML file: {error}") from None
     if root is not None and found.tag != root:
-        raise ValueError(f"{path} starts with <{found.tag}>: expected <{root}>.")
+        raise ValueError(f"{path} starts with <{found.tag}>: expected <{root}>")
     level = [found]
     for _ in range(DEEPEST):
         level = [child for element in level for child in element]
     if level:
-        raise ValueError(f"{path}: <{level[0].tag}> is nested in {DEEPEST} elements: expected fewer; divide the chain.")
+        raise ValueError(f"{path}: <{level[0].tag}> is nested in {DEEPEST} elements: expected fewer; divide the chain")
     return found
 
 
@@ -47,7 +47,7 @@ class Reader:
         """Value of an attribute that must be the default or one of some others."""
         text = self.text(name, default)
         if text not in (default, *others):
-            raise ValueError(f"{self.where}: {name} is {text!r}: expected one of {', '.join((default, *others))}.")
+            raise ValueError(f"{self.where}: {name} is {text!r}: expected one of {', '.join((default, *others))}")
         return str(text)
 
     def given(self, name: str) -> bool:
@@ -58,11 +58,11 @@ class Reader:
         text = self.text(name)
         if text is None:
             if default is None:
-                raise ValueError(f"{self.where} has no {name}: expected {_amount(count)}.")
+                raise ValueError(f"{self.where} has no {name}: expected {_amount(count)}")
             return np.array(list(default), float)
         values = self.some(name)
         if len(values) != count:
-            raise ValueError(f"{self.where}: {name} is {text!r}: expected {_amount(count)}.")
+            raise ValueError(f"{self.where}: {name} is {text!r}: expected {_amount(count)}")
         return values
 
     def some(self, name: str) -> np.ndarray:
@@ -73,7 +73,7 @@ class Reader:
         except ValueError:
             values = np.zeros(0)
         if not len(values) or not (np.abs(values) < largest(float)).all():
-            raise ValueError(f"{self.where}: {name} is {text!r}: expected finite numbers.")
+            raise ValueError(f"{self.where}: {name} is {text!r}: expected finite numbers")
         return values
 
     def number(self, name: str, default: float | None = None) -> float:
