@@ -57,15 +57,20 @@ def poses(dim, kind_a, kind_b):
     wanted, found = rng.choice([-0.002, 0.01, 0.3], POSES), np.zeros(POSES)
     for k in range(POSES):
         x[k] = 3.0 * towards[k]
+        turned, other = (place(shape, np.zeros(dim), q[i, k]) for i, shape in enumerate((a, b)))
         for _ in range(60):  # the distance along a line out of a convex body rises no faster than the way
-            found[k] = distance(dim, a, x[k], q[0, k], b, q[1, k])
+            found[k] = separation(moved(turned, x[k]), other)
             x[k] += (wanted[k] - found[k]) * towards[k]
-        found[k] = distance(dim, a, x[k], q[0, k], b, q[1, k])
+        found[k] = separation(moved(turned, x[k]), other)
     return (a, x, q[0]), (b, np.zeros((POSES, dim)), q[1]), found
 
 
 def so_rotate(dim, q, r):
     return np.asarray(rotations(dim).rotate(jnp.asarray(q), jnp.asarray(r)))
+
+
+def moved(outline, x):
+    return outline._replace(corners=outline.corners + x, starts=outline.starts + x)
 
 
 def distance(dim, a, x_a, q_a, b, q_b):

@@ -93,6 +93,7 @@ def test_nothing_tunnels():
     assert_allclose(energy[:, 1], 0.5 * speeds**2 + 0.5 * inertia * spins**2, rtol=EXACT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0.0, 1e-3])
 def test_a_rod_that_a_torque_spins_up_does_not_pass_a_peg(width):
     """It stands still where the step begins: how fast its end comes follows from the torque alone."""
@@ -108,11 +109,7 @@ def test_a_rod_that_a_torque_spins_up_does_not_pass_a_peg(width):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "shape",
-    [dr.Box(half=(0.01, 0.006)), dr.Capsule(radius=0.004, half_length=0.01)],
-    ids=type,
-)
+@pytest.mark.parametrize("shape", [dr.Box(half=(0.01, 0.006)), dr.Capsule(radius=0.004, half_length=0.01)], ids=type)
 def test_what_is_small_and_fast_does_not_tunnel_in_single_precision(shape):
     """Thrown at a thin slab, one after the other: together in a batch each would search as long as the slowest."""
     rng, dt, speed = np.random.default_rng(3), 1 / 60, 9.0

@@ -147,10 +147,8 @@ GROUND = {  # below y = 0, or z = 0
 }
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["box", *(pytest.param(k, marks=pytest.mark.slow) for k in GROUND if k != "box")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", GROUND)
 def test_what_is_round_and_smooth_strikes_as_if_it_did_not_spin(kind):
     """Slow impacts of a fast spin: w^2 r is far above gravity."""
     dim, shape, at = GROUND[kind]

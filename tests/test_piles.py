@@ -44,7 +44,8 @@ def test_a_pile_stands(pile):
     assert energy < STILL
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_stack_takes_a_fall(dtype):
     """Boxes fall apart from each other and land one on the other, without rebound: each stops where it lands."""
     box, count = dr.Box(half=(0.25, 0.25)), 6

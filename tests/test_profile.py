@@ -126,7 +126,8 @@ def test_on_vertices_in_line_in_a_valley_and_on_a_peak(shape):
     assert_allclose(x, expected, atol=EXACT)
 
 
-@pytest.mark.parametrize("shape", [dr.Disc(radius=0.2), pytest.param(dr.Box(half=(0.3, 0.2)), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", [dr.Disc(radius=0.2), dr.Box(half=(0.3, 0.2))])
 def test_what_slips_over_vertices_in_line_slips_as_on_a_plane(shape):
     """With friction and restitution; also its slopes."""
     grounds = dr.Profile(points=IN_LINE), dr.HalfSpace(normal=(0.0, 1.0))

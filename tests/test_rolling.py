@@ -175,6 +175,7 @@ def test_mistakes_are_named():
         dr.scene(bodies, spinning_friction=0.1)
 
 
+@pytest.mark.slow
 def test_two_contacts_share_the_friction_against_turning():
     """A capsule that lies on a floor and rolls sideways, or spins about the vertical: its way, and its turn."""
     r, time, ground = 0.1, 0.4, {"floor": floor(3)}
