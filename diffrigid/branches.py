@@ -1,13 +1,10 @@
-"""Branches of a program: their conditions, and their use to keep XLA from computing things twice."""
+"""Branches of a program: their conditions, and choices between two trees."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
-
-from diffrigid.devices import on_cpu
+from jax import Array
 
 
 @jax.custom_batching.custom_vmap
@@ -24,33 +21,6 @@ def any_world(flags: Array) -> Array:
 def _of_all_worlds(size: int, batched: list[bool], flags: Array) -> tuple[Array, bool]:
     del size, batched
     return any_world(flags), False
-
-
-def opaque_true(like: Array) -> Array:
-    """True, but not known to the compiler; see `unfused`. `like`: any array of the program, not infinite."""
-    return any_world(~(jnp.ravel(like)[:1] > jnp.inf))
-
-
-def unfused(live: Array, fn: Callable, *args: Any) -> Any:
-    """Evaluate fn(*args) by itself on a CPU: XLA does not fuse across a branch.
-
-    Where several results depend on one, XLA on a CPU computes it again inside each of them, and again for each
-    component that is picked from it: in a chain of products of vectors this grows exponentially. An
-    `optimization_barrier` is removed before fusion. So this is a choice that is always the same. On a GPU, where each
-    choice waits for the device, fusion is left to XLA: S2 of `experiments/throughput.py` runs three times as fast.
-
-    Args:
-        live: `opaque_true` of something.
-    """
-
-    if not on_cpu():
-        return fn(*args)
-
-    def never(*args):
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(once, *args))
-
-    once = jax.jit(fn)  # traced once for both
-    return lax.cond(live, once, never, *args)
 
 
 def choose(chosen: Array, new: Any, old: Any) -> Any:

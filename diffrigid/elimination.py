@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.branches import opaque_true, unfused
+from diffrigid.fence import unfused
 from diffrigid.gathers import rows
 
 PIVOT_ROUNDING = 1e2  # [-] times eps times the diagonal: where joints form loops, a pivot no larger counts as zero
@@ -151,10 +151,10 @@ def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
     """Factors of all levels, from blocks (n + pairs, E, E, *batch) of joints with themselves, then of `plan.pairs`."""
     count, rounding = len(plan.places), 0.0 if plan.is_tree else PIVOT_ROUNDING * jnp.finfo(blocks.dtype).eps
     tiny = rounding * jnp.stack([blocks[:count, e, e] for e in range(blocks.shape[1])], axis=1)
-    factors, live = [], opaque_true(blocks)
+    factors = []
     for level in plan.levels:
         own = rows(blocks, level.blocks)
-        inverse, near = unfused(live, _inverse, own[:, 0], rows(tiny, level.pivots)), own[:, 1:]
+        inverse, near = unfused(_inverse, own[:, 0], rows(tiny, level.pivots)), own[:, 1:]
         ready = _product(inverse[:, None], near, 2)
         factors.append(Factor(inverse, ready))
         if level.kept:

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.branches import opaque_true, unfused
+from diffrigid.fence import at_hand
 from diffrigid.gathers import MANY, fold
 from diffrigid.numerics import safe_divide
 
@@ -38,7 +38,7 @@ def _eliminated(matrix: Array, right: Array) -> Array:
     if len(matrix) <= UNROLLED:
         return _written_out(system)
     # Not fused; otherwise everything that the matrix is made of is computed in the order of the transposed one.
-    system = unfused(opaque_true(right), lambda system: system, system)
+    system = at_hand(system)
     # What elimination makes of the right side beside the matrix needs no permutation. With a row below the system is
     # square: libraries for GPUs take a batch of these at once, others one by one.
     count = len(matrix)

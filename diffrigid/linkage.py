@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.branches import opaque_true, unfused
 from diffrigid.constraints import (
     PlacedJoints,
     by_twists,
@@ -32,6 +31,7 @@ from diffrigid.constraints import (
     placed,
 )
 from diffrigid.elimination import Factor, factorise, plan_of, substitute
+from diffrigid.fence import at_hand, unfused
 from diffrigid.gathers import rows
 from diffrigid.joints import Pose
 from diffrigid.numerics import dot
@@ -61,10 +61,10 @@ class Linkage:
 def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> Linkage:
     """Linkage of the joints of a world at poses x (N, D, *batch), q (N, Q, *batch)."""
     so, ends = rotations(bodies.dim), ends_of(joints)
-    groups, live = placed(joints, statics, x, q), opaque_true(x)
+    groups = placed(joints, statics, x, q)
     inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q)
     inverse_mass = 1.0 / bodies.mass
-    sides = unfused(live, functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
+    sides = unfused(functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
     blocks = _blocks(so, ends, sides, *lax.stop_gradient((inverse_mass, inverse)))
     return Linkage(
         groups=groups, sides=sides, factors=factorise(plan_of(ends, len(x)), blocks), inverse_mass=inverse_mass,
@@ -159,7 +159,7 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench, span: Array) -> Wrench:
     """Forces of a world, with the constraint forces of its joints, for an integration over span (*batch) [s]."""
-    state = unfused(opaque_true(state.x), lambda state: state, state)  # otherwise recomputed for every use of it
+    state = at_hand(state)
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
     given = _damped(joints, link, twists_of(state), jnp.concatenate([wrench.F, torque], axis=1), span)
@@ -169,7 +169,7 @@ def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wren
     def falling(groups: tuple[PlacedJoints, ...], twists: Array, free: Array) -> Array:
         return joint_accelerations(so, groups, *(to_sides(link.ends, leaf) for leaf in (twists, free)))
 
-    target = unfused(opaque_true(state.x), falling, link.groups, twists_of(state), free)
+    target = unfused(falling, link.groups, twists_of(state), free)
     forces = given + _pull(link, _multipliers(link, target))
     return Wrench(F=forces[:, : so.D], tau=forces[:, so.D :])
 
@@ -251,7 +251,7 @@ def onto_joints(joints: tuple, statics: Any, bodies: Bodies, state: State) -> St
 
     Both use J at the poses before, so the velocities then satisfy the joints up to the effect of the displacement.
     """
-    state = unfused(opaque_true(state.x), lambda state: state, state)  # otherwise computed again for every use of it
+    state = at_hand(state)
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     off = jnp.stack([joint_errors(so, link.groups), _rates(link, twists_of(state))])
     moved, kicked = jax.vmap(lambda off: _moved(link, _pull(link, _multipliers(link, off))))(off)

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.branches import opaque_true
 from diffrigid.contact.strikes import ends, is_rolling
-from diffrigid.devices import on_cpu
+from diffrigid.fence import unfused
 from diffrigid.flight import Flight, launch
 from diffrigid.linkage import onto_joints
 from diffrigid.numerics import FOUND, PASSED, normalise, saving, with_tangents
@@ -96,11 +95,11 @@ def _scan(
 
 
 def fenced(world: World, saves: bool) -> Callable[[State, Array, Any], State]:
-    """`advance`, which reverse mode recomputes from the state; on a CPU behind a `lax.cond` that is always true.
+    """`advance`, which reverse mode recomputes from the state; on a CPU in a call that is not inlined.
 
     If it `saves` what the passes of a step find and hand on, each pass is recomputed from that.
 
-    Without the condition XLA fuses the read of the saved state into every loop of the backward step, which then
+    Otherwise XLA fuses the read of the saved state into every loop of the backward step, which then
     does not vectorise and costs several times as much.
     """
 
@@ -112,9 +111,7 @@ def fenced(world: World, saves: bool) -> Callable[[State, Array, Any], State]:
         def stepped(state):
             return advance(world, state, jnp.broadcast_to(dt, state.x.shape[2:]), controls)
 
-        if not on_cpu():
-            return stepped(state)
-        return lax.cond(opaque_true(dt), stepped, lambda state: state, state)
+        return unfused(stepped, state)
 
     return one_step
 

@@ -26,9 +26,9 @@ class Gaps(NamedTuple):
     held: Any = None  # gaps and rates of `HeldUp`, each (K, *batch); None: nothing is held up
 
 
-def gaps_at(a: Side, b: Side, s: Array, live: Array) -> Gaps:
+def gaps_at(a: Side, b: Side, s: Array) -> Gaps:
     """Gaps of all candidate contacts at time s (*batch) [s]."""
-    at_a, at_b = place(a, s, live), place(b, s, live)
+    at_a, at_b = place(a, s), place(b, s)
     if isinstance(b.shape, HalfSpace):
         return _gaps_of_corners(a, at_a, b)
     up = held_up(a, at_a, b, at_b, s)

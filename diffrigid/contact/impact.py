@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide.heights import of_nearest
 from diffrigid.collide.profile import on_next_segments
 from diffrigid.contact.approach import if_smooth, touches
@@ -39,6 +38,7 @@ from diffrigid.contact.sides import (
     reach_of,
     smaller_size,
 )
+from diffrigid.fence import unfused
 from diffrigid.numerics import FOUND, dot, implicit_root, norm, normalise, safe_divide, safe_sqrt, softplus
 from diffrigid.shapes import HalfSpace, HeightField, Profile
 from diffrigid.state import rotations
@@ -61,24 +61,24 @@ def find_impact(
 
     Differentiable except where an impact appears or vanishes (grazing), which is a kink for width = 0.
     """
-    live, begin = opaque_true(t1), earliest(a, b)[0]
+    begin = earliest(a, b)[0]
     varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
     if closed_form(a, b, straight) and not varying:
-        s0, level, found, _ = unfused(live, approach, a, b, width)
+        s0, level, found, _ = unfused(approach, a, b, width)
         rests = round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
     else:
         s0, level, found, rests = approach_search(a, b, t1, width, rest_speed, rested, at_end)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     s0, hit = checkpoint_name((s0, hit), FOUND)
-    at_a, at_b = place(a, s0, live), place(b, s0, live)
+    at_a, at_b = place(a, s0), place(b, s0)
     slack = jnp.maximum(AT_ONCE * smaller_size(a, b), gap_rounding(a, at_a, b, at_b))
     up = held_up(a, at_a, b, at_b, s0)
     at_a, at_b = up.at_a, up.at_b
     if up.way is None:
         contacts, turning = contacts_of(a, at_a, b, at_b), 0.0
     else:
-        contacts, moving = with_rates(live, a, at_a, b, at_b)
+        contacts, moving = with_rates(a, at_a, b, at_b)
         turning = jax.vmap(dot, (0, None))(moving.normal, up.way)  # in the rates of the gaps, as normals turn
     gaps = up.gaps(contacts)
     gap, speed = lax.stop_gradient((gaps, gap_rates(contacts, at_a, at_b)))

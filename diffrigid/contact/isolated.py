@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.branches import any_world, opaque_true, unfused
+from diffrigid.branches import any_world
 from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
@@ -25,6 +25,7 @@ from diffrigid.contact.materials import materials, mixed
 from diffrigid.contact.sides import Side
 from diffrigid.contact.slots import Slots, Table, meet, sides_of_table, slots_of, sum_of_terms, summed
 from diffrigid.contact.strikes import is_rolling, relative_path_is_straight
+from diffrigid.fence import unfused
 from diffrigid.flight import Flight, position, velocity
 from diffrigid.forces import is_constant
 from diffrigid.gathers import constant, fold
@@ -110,7 +111,7 @@ def next_impacts(world: "World", tables: tuple[Table, ...], flight: Flight, sinc
         next impacts; whether the slots suffice and all impacts are isolated, exact and with rebound, a bool; how many
         slots each world needs.
     """
-    moving, live = len(world.names), opaque_true(dt)
+    moving = len(world.names)
     tie = (jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt)[None]
     many = 1 + max(max(table.b) for table in tables)
 
@@ -133,9 +134,9 @@ def next_impacts(world: "World", tables: tuple[Table, ...], flight: Flight, sinc
         return lead, jnp.where(hit, other, -1.0), ~alone
 
     # Not fused: times are compared with each other, and must not be computed twice with different rounding.
-    times = [_times(live, world, table, flight, since, dt) for table in tables]
-    first = unfused(live, first_of, times)
-    lead, other, crossed = unfused(live, in_slots, first, unfused(live, with_what, times, first))
+    times = [_times(world, table, flight, since, dt) for table in tables]
+    first = unfused(first_of, times)
+    lead, other, crossed = unfused(in_slots, first, unfused(with_what, times, first))
     before = constant(tuple(tuple(float(i < j) for j in range(moving)) for i in range(moving)), str(dt.dtype))
     rank = sum_of_terms(lax.expand_dims(before, range(2, 1 + lead.ndim)), lead[:, None], 0)[:, 0]
     needed = fold(jnp.add, lead, 0)
@@ -148,11 +149,11 @@ def meet_in_rounds(
     world: "World", tables: tuple[Table, ...], following: Next, needed: Array, anchors: Anchors, launch: Any, dt: Array
 ) -> Anchors:
     """Anchors after the next impact of each body; rounds that no world needs are skipped."""
-    count, live = slots_of(len(world.names)), opaque_true(dt)
+    count = slots_of(len(world.names))
 
     @jax.checkpoint
     def meet_from(begin, anchors):
-        return meet(world, tables, fill_slots(tables, count, following, begin, live), anchors, launch, dt)
+        return meet(world, tables, fill_slots(tables, count, following, begin), anchors, launch, dt)
 
     def one_round(anchors, begin):
         return lax.cond(any_world(needed > begin), meet_from, lambda _, anchors: anchors, begin, anchors), None
@@ -161,7 +162,7 @@ def meet_in_rounds(
     return lax.scan(one_round, anchors, begins)[0]
 
 
-def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Array, live: Array) -> Slots:
+def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Array) -> Slots:
     """Fill the slots of a round with the impacts from index `begin` on that are the next one for both bodies."""
     moving = len(following.rank)
 
@@ -186,16 +187,16 @@ def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Ar
 
         return tuple(map(there, tables))
 
-    a = unfused(live, weights, following)
-    return Slots(a, unfused(live, of_b, *unfused(live, sides, a, following), following))
+    a = unfused(weights, following)
+    return Slots(a, unfused(of_b, *unfused(sides, a, following), following))
 
 
-def _times(live: Array, world: "World", table: Table, flight: Flight, since: Array, dt: Array) -> Array:
+def _times(world: "World", table: Table, flight: Flight, since: Array, dt: Array) -> Array:
     """Times of the next impacts (A, B, *batch) [s]; inf: none in this step; RESTS: without rebound."""
     a, b = sides_of_table(world, table, flight, since)
     if table.b[0] < a.flight.t0.shape[0]:
         return _times_of_pairs(world, table, a, since, dt)
-    return unfused(live, functools.partial(_times_to_statics, world, table), a, b, dt)
+    return unfused(functools.partial(_times_to_statics, world, table), a, b, dt)
 
 
 def _times_of_pairs(world: "World", table: Table, bodies: Side, since: Array, dt: Array) -> Array:
@@ -217,9 +218,8 @@ def _times_of_pairs(world: "World", table: Table, bodies: Side, since: Array, dt
         rests = (root <= world.contact.rest_speed * R) & (s <= dt)
         return jnp.where(rests, RESTS, s)
 
-    live = opaque_true(dt)
-    lines = (*unfused(live, at_start, bodies.flight), bodies.flight.t0, since, bodies.shape.radius)
-    return _allowed(table, unfused(live, jax.vmap(jax.vmap(one, (None, 0)), (0, None)), lines, lines))
+    lines = (*unfused(at_start, bodies.flight), bodies.flight.t0, since, bodies.shape.radius)
+    return _allowed(table, unfused(jax.vmap(jax.vmap(one, (None, 0)), (0, None)), lines, lines))
 
 
 def _times_to_statics(world: "World", table: Table, a: Side, b: Side, dt: Array) -> Array:
@@ -237,7 +237,7 @@ def _times_to_statics(world: "World", table: Table, a: Side, b: Side, dt: Array)
 
 
 def _times_to_planes(world: "World", table: Table, a: Side, b: Side, dt: Array) -> Array:
-    so, live, f = rotations(a.flight.dim), opaque_true(dt), a.flight
+    so, f = rotations(a.flight.dim), a.flight
     straight = relative_path_is_straight(world, both_move=False)
     names = ("restitution", "restitution_falloff")
     own, others = (materials(world, of, names) for of in (tuple(range(len(world.names))), table.b))
@@ -257,7 +257,7 @@ def _times_to_planes(world: "World", table: Table, a: Side, b: Side, dt: Array) 
         rests = comes_to_rest(u, restitution_at(u, *law) * u, closing_acc, dt - s, world.contact.rest_speed)
         return jnp.where(found, jnp.where(rests & (s <= dt), RESTS, s), jnp.inf)
 
-    n, offset, law = unfused(live, planes, b, own, others)
+    n, offset, law = unfused(planes, b, own, others)
     bodies = (f.x, f.v, f.a, f.t0, a.since, a.shape.radius)
     return jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, 0))(bodies, (n, offset), law)
 

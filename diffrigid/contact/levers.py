@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.branches import unfused
 from diffrigid.collide import Contacts
 from diffrigid.contact.sides import Placed, Side, contacts_of
+from diffrigid.fence import unfused
 from diffrigid.flight import Flight, angular_momentum
 from diffrigid.numerics import dot, safe_divide
 from diffrigid.pytree import array, pytree
@@ -66,12 +66,12 @@ def levers(
     return Levers(arm_a=ends[0], arm_b=ends[1], mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate)
 
 
-def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tuple[Contacts, Contacts]:
-    """Contacts of a pair, and their time derivatives at the bodies' velocities. For `live` see `unfused`."""
+def with_rates(a: Side, at_a: Placed, b: Side, at_b: Placed) -> tuple[Contacts, Contacts]:
+    """Contacts of a pair, and their time derivatives at the bodies' velocities."""
     so = rotations(at_a.x.shape[0])
     poses = [(at.x, at.q) for at in (at_a, at_b)]
     rates = [
-        tuple(map(jnp.zeros_like, pose)) if at.v is None else (at.v, unfused(live, so.rate, at.w, at.q))
+        tuple(map(jnp.zeros_like, pose)) if at.v is None else (at.v, unfused(so.rate, at.w, at.q))
         for at, pose in zip((at_a, at_b), poses, strict=True)
     ]
 
@@ -82,7 +82,7 @@ def with_rates(live: Array, a: Side, at_a: Placed, b: Side, at_b: Placed) -> tup
 
         return jax.jvp(placed, tuple(poses), tuple(rates))
 
-    return unfused(live, moved, a, b, poses, rates)
+    return unfused(moved, a, b, poses, rates)
 
 
 def acceleration(f: Flight, at: Placed, s: Array, arm: Array) -> Array:

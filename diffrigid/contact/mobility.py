@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrigid.branches import opaque_true, unfused
 from diffrigid.contact.cone import put
 from diffrigid.contact.sums import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
+from diffrigid.fence import unfused
 from diffrigid.gathers import sum_rows
 from diffrigid.linear import identity, matvec
 from diffrigid.linkage import Linkage, damped_later, is_damped, spread
@@ -241,7 +241,7 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
         return jax.vmap(each)(J, back)
 
     if batch:  # else XLA recomputes them for every twist of the other side
-        answers = functools.partial(unfused, opaque_true(arms.arm_a), answers)
+        answers = functools.partial(unfused, answers)
     back_a, back_b = answers(J_a), answers(J_b)
     own = side_sum(block(mid_a, back_a), block(mid_b, back_b), arms.a, arms.b, moving)
     diagonal = jnp.eye(moving, dtype=own.dtype).reshape(moving, moving, *[1] * (own.ndim - 1))

@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
-from diffrigid.branches import any_world, choose, opaque_true
+from diffrigid.branches import any_world, choose
 from diffrigid.contact.approach import (
     Polish,
     Task,
@@ -52,30 +52,30 @@ def approach_search(
 
     With `at_end`, a bool, nothing is searched. Only the level has a gradient.
     """
-    task, live = task_of(a, b, t1, width, rest_speed, rested), opaque_true(t1)
+    task = task_of(a, b, t1, width, rest_speed, rested)
     search = _stage_by_stage if isinstance(b.shape, HalfSpace) else _in_one_loop
-    end = search(task, jnp.where(at_end, task.t1, task.start), at_end, live)
+    end = search(task, jnp.where(at_end, task.t1, task.start), at_end)
     level, closest = checkpoint_name((end.level, end.closest), FOUND)
     if width is not None:
-        level = _differentiable(level, width, a, b, closest, live)
+        level = _differentiable(level, width, a, b, closest)
     s, (_, bound) = jnp.where(end.found, end.s, end.near), earliest(task.a, task.b)
     rests = checkpoint_name(end.rests, FOUND)
     return jnp.where(s < bound, task.start, s), level, end.found | end.inside, rests
 
 
 @jax.custom_jvp
-def _differentiable(level: Array, width: Array, a: Side, b: Side, closest: Closest, live: Array) -> Array:
+def _differentiable(level: Array, width: Array, a: Side, b: Side, closest: Closest) -> Array:
     """The level (*batch) [m] that a search has found, with the derivatives of the gaps at the closest approach."""
-    del width, a, b, closest, live
+    del width, a, b, closest
     return level
 
 
 @_differentiable.defjvp
 def _differentiable_jvp(primals, tangents):
-    level, width, a, b, closest, live = primals
+    level, width, a, b, closest = primals
 
     def at_closest(width: Array, a: Side, b: Side) -> Array:
-        looks = jax.vmap(lambda t: look_at(t, gaps_at(a, b, t, live)))(jnp.stack([closest.before, closest.after]))
+        looks = jax.vmap(lambda t: look_at(t, gaps_at(a, b, t)))(jnp.stack([closest.before, closest.after]))
         before, after = (jax.tree.map(operator.itemgetter(k), looks) for k in range(2))
         return jnp.where(closest.exists, level_at(before, after, width), 0.0)
 
@@ -97,12 +97,12 @@ class Found(NamedTuple):
     closest: Closest | None  # None: exact
 
 
-def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Found:
-    near, over, rests = _come_near(task, start, at_end, live)
+def _stage_by_stage(task: Task, start: Array, at_end: Array) -> Found:
+    near, over, rests = _come_near(task, start, at_end)
 
     def approach(near):
         def look(now):
-            return nearer(task, now, gaps_at(task.a, task.b, now.t, live))
+            return nearer(task, now, gaps_at(task.a, task.b, now.t))
 
         seen = lax.while_loop(lambda now: ~at_end & any_world(~now.done), look, from_time(near))
         return _polished_from(task, near, seen), seen.level(task.width), seen.closest()
@@ -112,12 +112,12 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array, live: Array) -> Fou
 
     near, level, nearest = if_smooth(task.width, approach, exact, near)
     nothing = over & (level <= 0)
-    s, look = _closed_in(task, near, level, rests, nothing | at_end, live)
+    s, look = _closed_in(task, near, level, rests, nothing | at_end)
     found = look.found(task) & ~nothing
     return Found(s, near, level, found, look.inside & ~nothing, rests, None if task.width is None else nearest)
 
 
-def _come_near(task: Task, start: Array, at_end: Array, live: Array) -> tuple[Array, Array, Array]:
+def _come_near(task: Task, start: Array, at_end: Array) -> tuple[Array, Array, Array]:
     """Where a pair that advances comes near [s], whether its step is over before, and which contacts rest."""
     clear = clearance(task)
 
@@ -131,19 +131,17 @@ def _come_near(task: Task, start: Array, at_end: Array, live: Array) -> tuple[Ar
     def advance(carry):
         count, s, dt, rests = carry
         s = jnp.where(s < task.t1, jnp.minimum(s + jnp.maximum(dt, 0.0), task.t1), s)
-        gaps = gaps_at(task.a, task.b, s, live)
+        gaps = gaps_at(task.a, task.b, s)
         rests = jnp.where(count == 0, resting(task, gaps), rests)
         return count + 1, s, clear(gaps, rests, s), rests
 
-    first = (0, start, jnp.zeros_like(start), jnp.zeros((_count(task, start, live), *start.shape), bool))
+    first = (0, start, jnp.zeros_like(start), jnp.zeros((_count(task, start), *start.shape), bool))
     _, near, dt, rests = lax.while_loop(flying, advance, first)
     over = (near < task.t1) & safe(near, dt)
     return jnp.where(over, task.t1, near), over, rests
 
 
-def _closed_in(
-    task: Task, near: Array, level: Array, rests: Array, nothing: Array, live: Array
-) -> tuple[Array, Polish]:
+def _closed_in(task: Task, near: Array, level: Array, rests: Array, nothing: Array) -> tuple[Array, Polish]:
     """The time [s] at which a pair that is near reaches its level, and the last look; `near` where there is nothing."""
     no = near < near
 
@@ -153,16 +151,16 @@ def _closed_in(
 
     def along(carry):
         count, s, before = carry
-        look = polish(task, gaps_at(task.a, task.b, s, live), rests, level, s)
+        look = polish(task, gaps_at(task.a, task.b, s), rests, level, s)
         return count + 1, s + look.dt, look._replace(inside=jnp.where(count == 0, look.inside, before.inside))
 
     _, s, look = lax.while_loop(polishing, along, (0, near, Polish(jnp.zeros_like(near), no, no, no)))
     return s, look
 
 
-def _count(task: Task, start: Array, live: Array) -> int:
+def _count(task: Task, start: Array) -> int:
     """Number of contacts."""
-    return len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start, live).gap))
+    return len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start).gap))
 
 
 class Search(NamedTuple):
@@ -180,9 +178,9 @@ class Search(NamedTuple):
     nearing: Nearing | None  # None: exact
 
 
-def _in_one_loop(task: Task, start: Array, at_end: Array, live: Array) -> Found:
+def _in_one_loop(task: Task, start: Array, at_end: Array) -> Found:
     none, zero, no = (
-        jnp.zeros((_count(task, start, live), *start.shape), start.dtype),
+        jnp.zeros((_count(task, start), *start.shape), start.dtype),
         jnp.zeros_like(start),
         start < start,
     )
@@ -194,7 +192,7 @@ def _in_one_loop(task: Task, start: Array, at_end: Array, live: Array) -> Found:
     def busy(now: Search) -> Array:
         return ~at_end & any_world(now.stage < DONE)
 
-    end = lax.while_loop(busy, lambda now: follow(now, gaps_at(task.a, task.b, now.s, live)), first)
+    end = lax.while_loop(busy, lambda now: follow(now, gaps_at(task.a, task.b, now.s)), first)
     nearest = None if end.nearing is None else end.nearing.closest()
     return Found(end.s, end.near, end.level, end.found, end.inside, end.rests, nearest)
 

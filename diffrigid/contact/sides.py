@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.branches import unfused
 from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.contacts import FAR
 from diffrigid.collide.distance import reach
 from diffrigid.collide.heights import candidates
+from diffrigid.fence import unfused
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import rows
 from diffrigid.numerics import dot, norm
@@ -85,14 +85,14 @@ def side_of(world: "World", flight: Flight, since: Array, kind: int, shape_rows:
 
 
 @jax.jit
-def place(side: Side, s: Array, live: Array) -> Placed:
-    """The collider at time s (*batch) [s]; for `live` see `unfused`."""
+def place(side: Side, s: Array) -> Placed:
+    """The collider at time s (*batch) [s]."""
     f = side.flight
     if f is None:
         return Placed(x=side.x, q=side.q)
     so = rotations(f.dim)
-    q = unfused(live, orientation, f, s)
-    inverse = unfused(live, so.world_inverse, f.inverse_inertia, q)
+    q = unfused(orientation, f, s)
+    inverse = unfused(so.world_inverse, f.inverse_inertia, q)
     L = angular_momentum(f, s)
     w = so.apply(inverse, L)
     # A torque that varies is left out: its curve may be steep where little is left of the step.

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.branches import opaque_true, unfused
 from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.impulse import impulses
@@ -20,6 +19,7 @@ from diffrigid.contact.materials import law, materials
 from diffrigid.contact.resting import Strikes
 from diffrigid.contact.sides import Side, side_of
 from diffrigid.contact.strikes import next_strikes
+from diffrigid.fence import unfused
 from diffrigid.flight import Flight, orientation
 from diffrigid.gathers import fold, pack
 from diffrigid.numerics import dot
@@ -66,13 +66,13 @@ class Blow(NamedTuple):
 
 def meet(world: "World", tables: tuple[Table, ...], slots: Slots, anchors: Anchors, launch: Any, dt: Array) -> Anchors:
     """The anchors after the impacts in the slots."""
-    flight, so, live = launch(anchors.state, anchors.t0), rotations(world.dim), opaque_true(dt)
+    flight, so = launch(anchors.state, anchors.t0), rotations(world.dim)
     moving, count = len(world.names), slots.a.shape[0]
     movers = [b for table, b in zip(tables, slots.b, strict=True) if table.b[0] < moving]
     weights = jnp.concatenate([slots.a, *movers])  # a of all slots, then b of all slots
     body, _ = sides_of_table(world, tables[0], flight, anchors.since)
     columns, unpack = pack((body, materials(world, tuple(range(moving)))), dt.ndim)
-    columns = _pick(live, weights, columns)
+    columns = _pick(weights, columns)
     columns_a, columns_b = [c[:count] for c in columns], [c[count:] for c in columns]
 
     def blow(unpack_b: Callable, columns_a: list, columns_b: list, there: Array) -> Blow:
@@ -89,19 +89,19 @@ def meet(world: "World", tables: tuple[Table, ...], slots: Slots, anchors: Ancho
     blows = []
     for table, there in zip(tables, slots.b, strict=True):
         if table.b[0] < moving:
-            blows.append(unfused(live, functools.partial(blow, unpack), columns_a, columns_b, there))
+            blows.append(unfused(functools.partial(blow, unpack), columns_a, columns_b, there))
         else:
             static, unpack_static = pack(_static(world, table, flight, anchors.since), dt.ndim)
-            static = _pick(live, there, static)
-            blows.append(unfused(live, functools.partial(blow, unpack_static), columns_a, static, there))
-    on, t, P, arm_a, arm_b = unfused(live, _impulses, blows)
+            static = _pick(there, static)
+            blows.append(unfused(functools.partial(blow, unpack_static), columns_a, static, there))
+    on, t, P, arm_a, arm_b = unfused(_impulses, blows)
     if movers:
         on, t, P, arm = (jnp.concatenate(pair) for pair in ((on, on), (t, t), (P, -P), (arm_a, arm_b)))
     else:
         arm = arm_a
-    after, unpack_after = pack(unfused(live, end, columns, t, P, arm), dt.ndim)
-    weights = unfused(live, lambda weights, on: weights * on[:, None], weights, on)
-    state, t = unpack_after(unfused(live, _put, weights, after))
+    after, unpack_after = pack(unfused(end, columns, t, P, arm), dt.ndim)
+    weights = unfused(lambda weights, on: weights * on[:, None], weights, on)
+    state, t = unpack_after(unfused(_put, weights, after))
     hit = fold(jnp.add, weights, 0) > 0
     old = (anchors.state, anchors.t0, anchors.since)
     state, t0, since = jax.tree.map(functools.partial(_where, hit), (state, t, t), old)
@@ -138,7 +138,7 @@ def summed(weights: Array) -> Array:
     return fold(jnp.add, weights, 1)
 
 
-def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
+def _pick(weights: Array, columns: list[Array]) -> list[Array]:
     """For each of E slots, the row (of A) whose weight (E, A, *batch) is 1; row 0 if none."""
 
     def filled(weights, total):
@@ -148,8 +148,8 @@ def _pick(live: Array, weights: Array, columns: list[Array]) -> list[Array]:
     def pick(weights, columns):
         return [_weighted_sum(weights, column, 1) for column in columns]
 
-    weights = unfused(live, filled, weights, unfused(live, summed, weights))
-    return unfused(live, pick, weights, columns)
+    weights = unfused(filled, weights, unfused(summed, weights))
+    return unfused(pick, weights, columns)
 
 
 def _put(weights: Array, columns: list[Array]) -> list[Array]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from diffrigid.branches import any_world, opaque_true, unfused
+from diffrigid.branches import any_world
 from diffrigid.collide import Contacts, PairGroup
 from diffrigid.collide.contacts import THERE
 from diffrigid.collide.heights import height_over
@@ -36,6 +36,7 @@ from diffrigid.contact.sides import (
 )
 from diffrigid.contact.stops import find_stops, is_drive, meet_stops, of_stops, stop_ends, stops_of
 from diffrigid.elimination import islands
+from diffrigid.fence import unfused
 from diffrigid.flight import Flight
 from diffrigid.forces import is_uniform
 from diffrigid.gathers import flags
@@ -81,7 +82,7 @@ def find_strikes(
     parts, jacs = [], {}
     for sides, meeting, own in zip(groups, meetings, rested, strict=False):
         each = jax.vmap(functools.partial(strikes_of, dt=dt, loaded=is_loaded(world)))
-        part = unfused(opaque_true(dt), each, *sides, meeting, own)
+        part = unfused(each, *sides, meeting, own)
         parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), part))
     if stops_of(world):
         stops = find_stops(world, flight, meetings[-1], dt)
@@ -150,11 +151,11 @@ def next_strikes(world: "World", a: Side, b: Side, dt: Array) -> Strikes:
 
 def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loaded: bool) -> Strikes:
     """Contacts of one pair, (K, ...); see `find_strikes`. `loaded`: whether resting contacts may carry a load."""
-    s, held, live = meeting.s, meeting.held, opaque_true(dt)
-    at_a, at_b = place(a, s, live), place(b, s, live)
+    s, held = meeting.s, meeting.held
+    at_a, at_b = place(a, s), place(b, s)
     up = held_up(a, at_a, b, at_b, s)
     at_a, at_b = up.at_a, up.at_b
-    contacts, moving = with_rates(live, a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
+    contacts, moving = with_rates(a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
     gaps, apart = up.gaps(contacts), held | is_supported(a, b)  # else the two are where they strike
     # Also contacts that opened because the body below fell away: they may close again once it is held, or struck.
     fall = dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None)

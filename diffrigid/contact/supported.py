@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.branches import opaque_true
 from diffrigid.contact.approach import resting, task_of
 from diffrigid.contact.gaps import gaps_at
 from diffrigid.contact.impact import closed_form, round_rests
@@ -45,4 +44,4 @@ def _rests(a: Side, b: Side, t1: Array, straight: bool, rest_speed: Array) -> Ar
     if closed_form(a, b, straight):
         return round_rests(a, b, earliest(a, b)[0], rest_speed)
     task = task_of(a, b, t1, None, rest_speed, jnp.zeros(t1.shape, bool))
-    return resting(task, gaps_at(a, b, task.start, opaque_true(t1))).any(0)
+    return resting(task, gaps_at(a, b, task.start)).any(0)
