@@ -4,6 +4,7 @@ import functools
 import itertools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -34,7 +35,11 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
     check(world, state)
     if a == b:
         raise ValueError(f"gap: {a!r} twice: name two bodies, or a body and a static")
-    world, state = align_all(*floats(world, state))
+    return _least(*align_all(*floats(world, state)), a, b)
+
+
+@functools.partial(jax.jit, static_argnames=("a", "b"))  # else each of its operations is compiled by itself
+def _least(world: World, state: State, a: str, b: str) -> Array:
     sides = [_placed(world, state, name) for name in (a, b)]
     gaps: list[Array] = []
     for one, other in itertools.product(*sides):

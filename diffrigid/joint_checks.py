@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from diffrigid.constraints import joint_rates, placed
 from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
@@ -169,19 +170,7 @@ def warn_of_torn_joints(world: "World", state: State) -> None:
     if not world.joints:
         return
 
-    so = rotations(world.dim)
-
-    def speeds(world: "World", state: State) -> Any:
-        parts = []
-        for group in world.joints:
-            at = placed((group,), world.statics, state.x, state.q)
-            u = to_sides(ends_of((group,)), twists_of(state))
-            rates, far = joint_rates(so, at, u), jax.vmap(places)(*at[0])
-            sizes = jnp.sqrt((u[..., : so.D] ** 2).sum((1, 2))) + far * jnp.sqrt((u[..., so.D :] ** 2).sum((1, 2)))
-            parts.append(jnp.stack([jnp.sqrt((rates**2).sum(1)), jnp.maximum(_rounding() * sizes, TYPED)]))
-        return jnp.concatenate(parts, axis=1)
-
-    rates, allowed = known(speeds, jax.tree.map(jnp.asarray, world), jax.tree.map(jnp.asarray, state))
+    rates, allowed = known(_speeds, jax.tree.map(jnp.asarray, world), jax.tree.map(jnp.asarray, state))
     names = [name for group in world.joint_names for name in group]
     for name, speed, most in zip(names, rates, allowed, strict=True):
         if speed > most:
@@ -190,6 +179,19 @@ def warn_of_torn_joints(world: "World", state: State) -> None:
                 "motion begins with the impulse that mends it; give the bodies v and w that fit",
                 stacklevel=3,
             )
+
+
+@jax.jit  # else each of its operations is compiled by itself
+def _speeds(world: "World", state: State) -> Array:
+    """How fast each joint comes apart, and how fast it may by rounding, (2, n) [m/s or rad/s]."""
+    so, parts = rotations(world.dim), []
+    for group in world.joints:
+        at = placed((group,), world.statics, state.x, state.q)
+        u = to_sides(ends_of((group,)), twists_of(state))
+        rates, far = joint_rates(so, at, u), jax.vmap(places)(*at[0])
+        sizes = jnp.sqrt((u[..., : so.D] ** 2).sum((1, 2))) + far * jnp.sqrt((u[..., so.D :] ** 2).sum((1, 2)))
+        parts.append(jnp.stack([jnp.sqrt((rates**2).sum(1)), jnp.maximum(_rounding() * sizes, TYPED)]))
+    return jnp.concatenate(parts, axis=1)
 
 
 def _unit(where: str, axis: Any) -> Any:

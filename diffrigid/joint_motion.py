@@ -32,6 +32,7 @@ def fields_of(joint: Any) -> tuple[str, ...]:
     return (COORDINATE[type(joint)], RATE) if type(joint) in COORDINATE else ()
 
 
+@functools.partial(jax.jit, static_argnames=("name", "field"))  # else each of its operations is compiled by itself
 def read(world: "World", state: State, name: str, field: str) -> Array:
     """The angle [rad], the translation [m] or the rate [rad/s, m/s] of a joint, (*batch)."""
     so, at = rotations(world.dim), _at(world, state, name)
@@ -42,6 +43,7 @@ def read(world: "World", state: State, name: str, field: str) -> Array:
     return change(so, coordinate, at.a, at.b, at.twists) if field == RATE else coordinate(at.a, at.b)
 
 
+@functools.partial(jax.jit, static_argnames=("name", "field"))
 def write(world: "World", state: State, name: str, field: str, value: Array) -> State:
     """Change a state, without batch axes, so that `read` gives the value. Velocities turn with the bodies."""
     side, bodies = moving_side(world, name)

@@ -17,6 +17,7 @@ The dots stand for the coefficients that only some worlds have: restitution_fall
 spinning_friction.
 """
 
+import functools
 from typing import Any
 
 import jax
@@ -95,6 +96,7 @@ def write(world: World, state: State, path: str, value: Any) -> tuple[World, Sta
     return pair
 
 
+@functools.partial(jax.jit, static_argnames="solid")
 def _solid(world: World, solid: tuple[Seat, ...]) -> tuple[Array, Array]:
     """Volume [m^D] and inertia over mass [m^2] of the shapes of a body."""
     shapes, r, q = zip(*(seated(world, seat) for seat in solid), strict=True)

@@ -102,6 +102,7 @@ def _of_each(of_one: F) -> F:
 
 
 @_of_each
+@jax.jit
 def kinetic_energy(bodies: Bodies, state: State) -> Array:
     """Kinetic energy of each body, m v.v / 2 + w.L / 2, (N, *batch) [J]; of states as `rollout` has them (..., N).
 
@@ -119,6 +120,7 @@ def kinetic_energy(bodies: Bodies, state: State) -> Array:
 
 
 @_of_each
+@jax.jit
 def momentum(bodies: Bodies, state: State) -> Array:
     """Linear momentum of each body, m v, (N, D, *batch) [kg m/s]; of states as `rollout` has them (..., N, D).
 
@@ -134,6 +136,7 @@ def momentum(bodies: Bodies, state: State) -> Array:
 
 
 @_of_each
+@jax.jit
 def angular_momentum(bodies: Bodies, state: State) -> Array:
     """Angular momentum of each body about the world origin, x * p + L, (N, A, *batch) [kg m^2/s].
 

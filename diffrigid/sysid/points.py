@@ -1,10 +1,12 @@
 """A point of a fit, which is on the devices, as NumPy arrays: by record and by column, without missing values."""
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from diffrigid.sysid.covariance import Linear
 from diffrigid.sysid.levenberg import Point
@@ -29,14 +31,20 @@ def linear_of(problem: Problem, point: Point, best: int, loss: Loss, estimated: 
     return Linear(residuals, jacobians, times, problem.sizes[0], variance, estimated)
 
 
+@partial(jax.jit, static_argnames="loss")
+def _slopes_of(loss: Loss, residuals: Array) -> tuple[Array, Array]:
+    """First and second derivatives of the loss at each residual."""
+    return jax.jvp(jax.grad(lambda r: loss.rho(r).sum()), (residuals,), (jnp.ones_like(residuals),))
+
+
 def _as_least_squares(loss: Loss, residuals: tuple[np.ndarray, ...], numbers: int) -> tuple[Any, float]:
     """Pseudo-residuals with which least squares acts as the loss with these residuals, and their variance."""
     if isinstance(loss, Squares):
         return residuals, 1.0
     joined = jnp.asarray(np.concatenate(residuals))
-    slope = jax.grad(lambda r: loss.rho(r).sum())
-    bend = float(jax.jvp(slope, (joined,), (jnp.ones_like(joined),))[1].mean())
-    parts = tuple(np.asarray(slope(jnp.asarray(r)), float) / max(bend, LEAST_BEND) for r in residuals)
+    slopes, bends = _slopes_of(loss, joined)
+    ends = np.cumsum([len(r) for r in residuals])[:-1]
+    parts = tuple(np.split(np.asarray(slopes, float) / max(float(bends.mean()), LEAST_BEND), ends))
     variance = float(sum((part**2).sum() for part in parts) / max(len(joined) - numbers, 1))
     return parts, variance
 

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from diffrigid.catalogue import catalogue, component
 from diffrigid.constraints import joint_errors, placed
@@ -61,9 +62,9 @@ def sticking(problem: Problem, point: Point, best: int, linear: Linear, covarian
         one = rows.start
         if not component(slot.paths[0])[0].endswith("friction") or not 0 < covariance[one, one] < LARGE**2:
             continue
-        z = _everywhere(point, best)
-        above = z._replace(shared=z.shared.at[one].add(2.0 * np.sqrt(covariance[one, one])))
-        slopes = linear_of(problem, point_at(problem.groups, above), best, Squares(), False).slopes
+        up = 2.0 * np.sqrt(covariance[one, one]) * np.eye(len(point.z.shared))[one]
+        above = _beside(problem, point, best, up, np.zeros(point.z.own.shape[:-1]))
+        slopes = linear_of(problem, above, best, Squares(), False).slopes
         if sum((jacobian[:, one] ** 2).sum() for jacobian in slopes) < ONE_SIDED * information[one]:
             out.append(
                 f"{slot.name} ended where what slips begins to stick: larger values fit as well, whatever the upper "
@@ -72,9 +73,15 @@ def sticking(problem: Problem, point: Point, best: int, linear: Linear, covarian
     return out
 
 
-def _everywhere(point: Point, best: int) -> Numbers:
-    """The numbers of the best start in the places of all."""
-    return jax.tree.map(lambda leaf: jnp.repeat(leaf[..., best : best + 1], leaf.shape[-1], -1), point.z)
+def _beside(problem: Problem, point: Point, best: int, shared: np.ndarray, own: np.ndarray) -> Point:
+    """The point of the best start moved by `shared` (a) and `own` (b, R), in the places of all."""
+    by = Numbers(*(jnp.asarray(part, problem.dtype) for part in (shared, own)))
+    return point_at(problem.groups, _moved(point.z, best, by))
+
+
+@jax.jit
+def _moved(z: Numbers, best: Array, by: Numbers) -> Numbers:
+    return jax.tree.map(lambda leaf, by: jnp.broadcast_to((leaf[..., best] + by)[..., None], leaf.shape), z, by)
 
 
 def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, loss: Any) -> list[str]:
@@ -94,8 +101,7 @@ def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, los
     if falls < FALLS[0]:
         return []
     share = min(1.0, FALLS[1] / falls)
-    step = Numbers(*(jnp.asarray(share * part, problem.dtype)[..., None] for part in (shared, own.T)))
-    beside = point_at(problem.groups, jax.tree.map(jnp.add, _everywhere(point, best), step))
+    beside = _beside(problem, point, best, share * shared, share * own.T)
     here, there = (float(cost_of(loss, p.residuals)[k]) for p, k in ((point, best), (beside, 0)))
     if there - here < JUMPS:
         return []

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax import Array
 
 from diffrigid.convert import positive
 from diffrigid.forces import is_constant
@@ -50,6 +51,11 @@ def _with_changes(run: Run, t: np.ndarray) -> np.ndarray:
     return _once(t, *(c.t[(c.t > t[0]) & (c.t < t[-1])] for c in run.controls))
 
 
+@jax.jit
+def _rows_of(tree: Any, index: Array) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
 def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
     """Motion of a record from its start, at increasing times t (K,) [s] after it, with steps up to `longest` [s]."""
     since = _with_changes(run, _once([run.start], t))
@@ -62,7 +68,7 @@ def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
 
     return Trajectory(
         t=t,  # type: ignore[arg-type]
-        state=jax.tree.map(lambda leaf: leaf[wanted], states),
+        state=_rows_of(states, wanted),
         world=scene.world,
         controls=jax.tree.map(mean, controls),
     )
