@@ -34,8 +34,9 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _memory():
-    """Programs of one file are of no use to the next."""
+def _memory(request):
+    """Programs of files that take long are of no use to the next; small ones, of single operations, are."""
     yield
-    jax.clear_caches()
-    gc.collect()
+    if request.path.stem.removeprefix("test_") in LONG:
+        jax.clear_caches()
+        gc.collect()

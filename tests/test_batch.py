@@ -56,7 +56,7 @@ def one_by_one(world, state, v, e):
         yield dr.rollout(dr.replace(world, bodies=bodies), dr.replace(state, v=v[i]), dt=1 / 60, steps=40).state
 
 
-@pytest.mark.parametrize("chunk", [2, None])
+@pytest.mark.parametrize("chunk", [2, pytest.param(None, marks=pytest.mark.slow)])
 def test_batch_equals_loop(many, chunk):
     world, state, worlds, states, v, e = many
     batch = dr.rollout_batch(worlds, states, dt=1 / 60, steps=40, chunk=chunk)

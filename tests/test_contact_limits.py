@@ -367,6 +367,7 @@ def test_a_corner_that_rests_hides_no_impact_of_another():
     assert lowest.min() > -1e-5  # 15 mm where an impact is found a step late
 
 
+@pytest.mark.slow
 def test_a_tip_that_slides_down_one_side_of_a_valley_hides_no_impact_of_the_other():
     """One tip of a rod slides down one side of a valley, the other side strikes the rod, and then its other tip."""
     c, rod = np.sqrt(0.5), dr.Capsule(radius=0.1, half_length=0.25)

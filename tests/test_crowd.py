@@ -82,6 +82,7 @@ def test_a_fit_of_a_crowd_takes_steps_as_of_other_bodies_that_touch(many):
     assert dr.sysid.make_problem(world, state, data, free={"d0.v": dr.real()}).dt == 0.02
 
 
+@pytest.mark.slow
 def test_spheres_keep_momentum_and_lose_energy(many):
     """27 spheres that fly into each other, of unequal principal inertias, with friction."""
     rng = np.random.default_rng(5)

@@ -205,6 +205,7 @@ def test_cradle_of_touching_balls(rounding):
     assert_allclose(end.x[-1, :, 0], [0.0, 1.0, 2.0, 3.0, 6.0, -1.0], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
 @pytest.mark.parametrize("tilt", [2e-4, 1e-3])
 def test_a_cube_tilted_by_little_falls_flat(tilt, dtype):
@@ -514,6 +515,7 @@ GROUNDS = {
 }  # shapes, their places, half sizes of the box that slides
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ground", ["tiles", *(pytest.param(name, marks=pytest.mark.slow) for name in ("box", "profile", "slabs"))]
 )

@@ -35,6 +35,7 @@ def weighted(x):
     return (x * jnp.arange(1.0, 1.0 + x.size).reshape(x.shape)).sum()
 
 
+@pytest.mark.slow
 def test_slopes_of_the_fast_way_are_those_of_differences():
     """In reverse mode, of weighted final positions, along one direction for all leaves of the start."""
     world, state = crowd(0.4)

@@ -68,6 +68,7 @@ def test_pendulum_and_its_derivatives():
     assert_allclose(forward, slopes, rtol=EXACT)
 
 
+@pytest.mark.slow
 def test_hinge_in_space_is_the_hinge_in_the_plane():
     flat, space = (end_of(pendulum(*map(jnp.asarray, PENDULUM), dim=dim), 1.0, 60) for dim in (2, 3))
     assert_allclose(space.x[0, :2], flat.x[0], atol=1e-6)  # rotations are integrated in other numbers

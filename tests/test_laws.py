@@ -438,6 +438,7 @@ def test_equal_elastic_balls_exchange_their_motions():
     assert_allclose(jac[np.ix_(x, speeds)], 1.0 * exchange, atol=EXACT)  # times t = 1 s
 
 
+@pytest.mark.slow
 def test_final_height_is_smooth_in_the_initial_height():
     """No sawtooth as the impact moves through the steps: a straight line of slope -1 without gravity, else a curve."""
     heights, t = np.linspace(0.5, 0.6, 21), 0.6  # the impacts fall into 3 steps

@@ -264,6 +264,7 @@ def test_energy_counts_springs():
     np.testing.assert_allclose(energies(world, one), [[0.0, 0.5 * 8 * 0.4**2, 0.5 * 8 * 0.4**2]], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_plate_without_thickness_is_drawn_with_its_impacts():
     plate = dr.Body(dr.Box(half=(0.5, 0.3, 0.0)), mass=1.0, x=(0.0, 0.0, 0.6), q=(0.8, 0.0, 0.6, 0.0))
     floor = dr.Static(dr.HalfSpace(normal=(0.0, 0.0, 1.0)))

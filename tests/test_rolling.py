@@ -146,6 +146,7 @@ def test_an_impact_stops_some_of_the_turning():
     check_with_slopes(turn, expected, [(0.01, 3.0, 0.6), (0.1, 3.0, 0.6)], jax.jacfwd)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_energy_falls_and_momenta_are_kept(dim):
     """Two bodies that meet with spin, with restitution and without."""

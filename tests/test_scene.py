@@ -242,6 +242,7 @@ def test_a_body_without_a_shape_flies(body):
     assert_allclose(after.x[-1, 0], np.asarray(body.x) + 1.0 - 5.0 * np.eye(dim)[-1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_plates_without_thickness_may_lie_side_by_side():
     """Some of their edges have no length."""
     plate = dr.Box(half=(0.5, 0.5, 0.0))

@@ -162,6 +162,7 @@ def test_a_pendulum_rests_on_its_stop():
         assert float(dr.kinetic_energy(world.bodies, jax.tree.map(lambda leaf: leaf[-1], path)).sum()) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metre", [1.0, 1e-9])
 def test_a_slider_between_elastic_stops_keeps_its_energy(metre):
     body = dr.Body(None, mass=1.0, inertia=0.1, x=(0.1 * metre, 0.0), v=(1.3 * metre, 0.0))
@@ -269,7 +270,8 @@ def test_mistakes_are_named(along, message):
         wheel(1.0, **along)
 
 
-@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dim", [2, 3])
 def test_limits_may_lie_beyond_half_a_turn(dim):
     """Where the angle of an orientation jumps nothing happens, and what has one limit turns from it as long as it likes.
 

@@ -278,6 +278,7 @@ def swing(times, friction, damping):
     return np.interp(times, h * np.arange(len(path)), path)
 
 
+@pytest.mark.slow
 def test_a_hinge_that_rubs_tells_dry_friction_from_damping():
     """Three seconds in which swings shorten by a constant, which is dry friction, and by a share, which is damping.
 
