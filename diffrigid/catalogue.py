@@ -152,11 +152,11 @@ def hint(world: World, path: str, known: Iterable[str]) -> str:
     owners: dict[str, Any] = dict(zip(world.force_names, world.forces, strict=True)) | dict(joints)
     of_body = owner in world.names and field in COEFFICIENTS
     if of_body or (owner in owners and field in array_fields(owners[owner])):
-        return f"it was left out when the scene was made: give {owner} a {field} to begin with."
+        return f"it was left out when the scene was made: give {owner} a {field} to begin with"
     if owner in dict(joints) and field in joint_motion.fields_of(owners[owner]):
-        return f"{owner} is part of a closed loop, so that what hangs on it cannot be moved alone: set bodies instead."
+        return f"{owner} is part of a closed loop, so that what hangs on it cannot be moved alone: set bodies instead"
     if path == "gravity" and (several := _gravities(world)):
-        return f"there are {len(several)}: use {' or '.join(f'{name}.g' for name in several)}."
+        return f"there are {len(several)}: use {' or '.join(f'{name}.g' for name in several)}"
     return nearest(path, known)
 
 

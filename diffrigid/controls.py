@@ -54,7 +54,7 @@ def as_controls(
     if not isinstance(controls, Mapping) or any(name not in sizes for name in controls):
         if all(isinstance(force, FORCES) for force in forces):
             unused = [name for name in given if name not in sizes] or [controls]
-            hint = nearest(str(unused[0]), sizes) if sizes else "give Force or Torque a control."
+            hint = nearest(str(unused[0]), sizes) if sizes else "give Force or Torque a control"
             raise ValueError(f"controls: no force takes {', '.join(map(repr, unused))}: {hint}")
 
     whole_controls = [given[name] for name in sizes]  # a list of numbers is one array

@@ -26,7 +26,7 @@ Numbers = Any  # np.ndarray where known, Array where traced
 def nearest(name: str, names: Iterable[str]) -> str:
     """Text that lists the names most similar to one that does not exist."""
     near = difflib.get_close_matches(str(name), sorted(names), n=3, cutoff=0.4)
-    return f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(sorted(names))}."
+    return f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(sorted(names))}"
 
 
 def known(fn: Callable, *args: Any) -> Any:

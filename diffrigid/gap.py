@@ -33,6 +33,10 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
         0.9
     """
     check(world, state)
+    names = (*world.names, *world.static_names)
+    for name in (a, b):
+        if name not in names:
+            raise ValueError(f"gap: {name!r} is neither a body nor a static: {nearest(name, names)}")
     if a == b:
         raise ValueError(f"gap: {a!r} twice: name two bodies, or a body and a static")
     return _least(*align_all(*floats(world, state)), a, b)
@@ -53,10 +57,7 @@ def _least(world: World, state: State, a: str, b: str) -> Array:
 
 def _placed(world: World, state: State, name: str) -> list[tuple[Any, Array, Array]]:
     """Shapes of a body or static, and where their origins are: x (D, *batch) [m], q (Q, *batch)."""
-    names = (*world.names, *world.static_names)
-    if name not in names:
-        raise ValueError(f"gap: {name!r} is neither a body nor a static: {nearest(name, names)}")
-    k, moving = names.index(name), len(world.names)
+    k, moving = (*world.names, *world.static_names).index(name), len(world.names)
     x, q = (state.x[k], state.q[k]) if k < moving else (world.statics.x[k - moving], world.statics.q[k - moving])
     found = []
     for shape, r, turn in (seated(world, seat) for seat in seats(world) if seat.owner == k):

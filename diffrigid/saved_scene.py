@@ -118,5 +118,5 @@ def _decoded(data: Any, kinds: Mapping[str, type]) -> Any:
     fields = {name: _decoded(value, kinds) for name, value in data.items()}
     name = fields.pop("record")
     if name not in kinds:
-        raise ValueError(f"no class {name!r}: {nearest(name, kinds)} One of your own is given by kinds=({name},)")
+        raise ValueError(f"no class {name!r}: {nearest(name, kinds)}; one of your own is given by kinds=({name},)")
     return kinds[name](**fields)
