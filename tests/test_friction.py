@@ -206,7 +206,7 @@ def test_cradle_of_touching_balls(rounding):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("tilt", [2e-4, 1e-3])
 def test_a_cube_tilted_by_little_falls_flat(tilt, dtype):
     """About its lower edge, faster and faster at 3 g / 8 h, within the first step of 1/240 s or the second."""
@@ -516,9 +516,7 @@ GROUNDS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "ground", ["tiles", *(pytest.param(name, marks=pytest.mark.slow) for name in ("box", "profile", "slabs"))]
-)
+@pytest.mark.parametrize("ground", ["tiles", "box", "profile", "slabs"])
 def test_a_box_slides_past_an_edge_as_over_one_face(ground):
     """Its centre stays over the ground; corners go beyond the edge at any phase of a step. Closed form v - mu g t."""
     shape, places, half = GROUNDS[ground]

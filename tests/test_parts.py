@@ -137,7 +137,7 @@ def two_hammers():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", [two_dumbbells, pytest.param(two_hammers, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scene", [two_dumbbells, two_hammers])
 def test_bodies_of_parts_keep_momenta_and_energy_and_have_slopes(scene):
     """Slopes by where a part sits, how large it is, and a spin, against differences."""
     world, state = scene()

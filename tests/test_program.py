@@ -56,7 +56,7 @@ def size(scene, *args, steps=STEPS):
 
 
 def test_programs_do_not_grow_unnoticed():
-    assert size(discs, 4) < MARGIN * 28800
+    assert size(discs, 4) < MARGIN * 28200
     assert size(cube) < MARGIN * 31400
 
 

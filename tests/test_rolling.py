@@ -147,7 +147,7 @@ def test_an_impact_stops_some_of_the_turning():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [2, 3])
 def test_energy_falls_and_momenta_are_kept(dim):
     """Two bodies that meet with spin, with restitution and without."""
 

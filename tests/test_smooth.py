@@ -178,9 +178,7 @@ def passed(since, kind, width):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", ["disc and box", *(pytest.param(name, marks=pytest.mark.slow) for name in ("two capsules", "two boxes"))]
-)
+@pytest.mark.parametrize("kind", ["disc and box", "two capsules", "two boxes"])
 def test_the_phase_of_the_step_does_not_matter(kind):
     """What is struck and how does not depend on where on their paths steps begin, nor do its slopes."""
 
