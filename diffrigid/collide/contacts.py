@@ -1,5 +1,7 @@
 """The record that every pair function returns."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,11 +22,17 @@ class Contacts:
     gap: Array = array("K")  # (K, *batch) [m] signed distance, negative in penetration
     normal: Array = array("K", "D")  # (K, D, *batch) [-] unit, from b to a
     point: Array = array("K", "D")  # (K, D, *batch) [m] midway between the two surfaces
+    feature: Any = array("K", default=None)  # (K, *batch) [-] number of the corner or crossing; None: always the same
 
 
 def joined(*parts: Contacts) -> Contacts:
     """One list of several."""
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
+
+
+def transferred(flags: Array, then: Array | None, now: Array | None) -> Array:
+    """Flags (K, *batch) bool of contacts with the features `then`, at the same features `now`."""
+    return flags if then is None or now is None else ((now[:, None] == then[None]) & flags[None]).any(1)
 
 
 def in_world(contacts: Contacts, x: Array, q: Array) -> Contacts:

@@ -12,6 +12,7 @@ from diffrigid.collide.contacts import Contacts, joined, slack_of
 from diffrigid.collide.distance import core_distance
 from diffrigid.collide.edges import crossing_edges
 from diffrigid.numerics import dot, norm
+from diffrigid.pytree import replace
 from diffrigid.shapes import Disc, Sphere, edges, radius, vertices
 from diffrigid.state import rotations
 
@@ -33,7 +34,8 @@ def convex_convex(a, x_a: Array, q_a: Array, b, x_b: Array, q_b: Array) -> Conta
     separated = _separates(parts[0], corners_a, rounding, slack)
     separated = separated | _separates(_flip(parts[1]), corners_b, rounding, slack)
     crossings = crossing_edges(a, corners_a, b, corners_b, contacts, separated, slack)
-    return joined(contacts, crossings)
+    number = -1.0 - lax.broadcasted_iota(slack.dtype, contacts.gap.shape, 0)
+    return joined(replace(contacts, feature=number), crossings)
 
 
 def _placed(shape, x: Array, q: Array) -> Array:

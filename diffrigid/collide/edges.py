@@ -51,7 +51,7 @@ def crossing_edges(
     nearest, index = lax.top_k(-order, count)
     # By number: in order of their distances they would change places within a step, and what is known of each be lost.
     number = jnp.where(nearest > -FAR, index, size_a * size_b)
-    _, nearest, index = (jnp.moveaxis(leaf, -1, 0) for leaf in lax.sort((number, nearest, index)))
+    number, nearest, index = (jnp.moveaxis(leaf, -1, 0) for leaf in lax.sort((number, nearest, index)))
 
     def pick(of: Edges, row: Array) -> Edges:
         chosen = jax.nn.one_hot(row, of.start.shape[1], axis=0, dtype=of.start.dtype)
@@ -65,7 +65,7 @@ def crossing_edges(
     gap = jnp.where(exists, chosen.distance - (radius(a) + radius(b))[None], FAR)
     shift = (radius(b) - radius(a))[None, None] * chosen.normal  # from between the cores to between the surfaces
     middle = 0.5 * (chosen.on_a + chosen.on_b + shift)
-    return Contacts(gap=gap, normal=chosen.normal, point=middle)
+    return Contacts(gap=gap, normal=chosen.normal, point=middle, feature=number.astype(gap.dtype))
 
 
 def edges_of(shape, corners: Array) -> Edges:
@@ -114,8 +114,8 @@ def crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
 def are_outermost(c: Crossing, deepest: Array, slack: Array) -> Array:
     """Whether, along the normal, both edges of crossings are the extremes of their shapes, (E, E, *batch) bool.
 
-    They are so but for a dip where one face comes down on another beside a corner that is inside by more: the one with
-    the least gap, `deepest` [m].
+    They are so but for a dip where one face comes down on another beside a corner or crossing that is inside by more:
+    the one with the least gap, `deepest` [m].
     """
     dip = jnp.where(c.distance >= deepest, DIP * size_of(slack), slack)
     return c.lowest >= -dip
@@ -128,7 +128,9 @@ def _order(c: Crossing, separated: Array, slack: Array, deepest: Array) -> Array
     penetration only if nothing separates the bodies.
     """
     apart = c.distance > slack
-    separated = separated | (c.within & (c.lowest >= -slack) & apart).any((0, 1))
+    outermost = c.within & (c.lowest >= -slack)
+    separated = separated | (outermost & apart).any((0, 1))
+    deepest = jnp.minimum(deepest, jnp.where(outermost & ~apart, c.distance, jnp.inf).min((0, 1)))
     touches = are_outermost(c, deepest, slack) & ~separated[None, None]
     return jnp.where(c.within & (apart | touches), jnp.abs(c.distance), FAR)
 

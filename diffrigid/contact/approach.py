@@ -122,7 +122,7 @@ def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:
         return jnp.where(s < t1, unseen_for(b.shape, b.q, height, v, spinning), jnp.inf)
 
     def clear(gaps: Gaps, rests: Array, s: Array) -> Array:
-        gap, v, acc, normal, _ = gaps
+        gap, v, acc, normal, *_ = gaps
         if normal is None:
             apart = _time_to(gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
         else:

@@ -24,6 +24,7 @@ class Gaps(NamedTuple):
     acceleration: Array  # (K, *batch) [m/s^2]
     normal: Array | None  # (K, D, *batch) None: that of a half-space
     held: Any = None  # gaps and rates of `HeldUp`, each (K, *batch); None: nothing is held up
+    feature: Array | None = None  # (K, *batch), as in `Contacts`
 
 
 def gaps_at(a: Side, b: Side, s: Array) -> Gaps:
@@ -44,7 +45,7 @@ def gaps_at(a: Side, b: Side, s: Array) -> Gaps:
     rates, held = gap_rates(contacts, at_a, at_b), None
     if up.speed is not None:
         held = contacts.gap, rates - jax.vmap(dot, (None, 0))(up.speed, contacts.normal)
-    return Gaps(up.gaps(contacts), rates, acceleration, contacts.normal, held)
+    return Gaps(up.gaps(contacts), rates, acceleration, contacts.normal, held, contacts.feature)
 
 
 def _gaps_of_corners(a: Side, at: Placed, b: Side) -> Gaps:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from diffrigid.collide.contacts import transferred
 from diffrigid.collide.heights import of_nearest
 from diffrigid.collide.profile import on_next_segments
 from diffrigid.contact.approach import if_smooth, touches
@@ -65,9 +66,9 @@ def find_impact(
     varying = any(side.flight is not None and side.flight.jerk is not None for side in (a, b))
     if closed_form(a, b, straight) and not varying:
         s0, level, found, _ = unfused(approach, a, b, width)
-        rests = round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None]
+        rests, feature = round_rests(*lax.stop_gradient((a, b, begin, rest_speed)))[None], None
     else:
-        s0, level, found, rests = approach_search(a, b, t1, width, rest_speed, rested, at_end)
+        s0, level, found, rests, feature = approach_search(a, b, t1, width, rest_speed, rested, at_end)
     hit = found & (s0 <= t1) & ~at_end
     s0 = lax.stop_gradient(jnp.where(hit, s0, t1))
     s0, hit = checkpoint_name((s0, hit), FOUND)
@@ -80,7 +81,7 @@ def find_impact(
     else:
         contacts, moving = with_rates(a, at_a, b, at_b)
         turning = jax.vmap(dot, (0, None))(moving.normal, up.way)  # in the rates of the gaps, as normals turn
-    gaps = up.gaps(contacts)
+    gaps, rests = up.gaps(contacts), transferred(rests, feature, contacts.feature)
     gap, speed = lax.stop_gradient((gaps, gap_rates(contacts, at_a, at_b)))
     closes = (gap <= (lax.stop_gradient(level) + slack)[None]) & (speed < -rest_speed[None]) & hit[None]
     if len(rests) == len(gap) == 1:  # as it falls, a resting contact would always be next, and hide others
@@ -104,7 +105,10 @@ def find_impact(
         rests = of_nearest(a.shape, b.shape, rests, len(gap)) if on_grid else at_corners(a, at_a, contacts, rests)
     elif isinstance(b.shape, Profile):
         rests = on_next_segments(a.shape, b.shape, rests)
-    return Meeting(s=s, hit=hit | at_end, fast=closes.any(0), rests=rests & ~at_end, level=level, slack=slack)
+    return Meeting(
+        s=s, hit=hit | at_end, fast=closes.any(0), rests=rests & ~at_end, feature=contacts.feature, level=level,
+        slack=slack,
+    )  # fmt: skip
 
 
 def round_rests(a: Side, b: Side, start: Array, rest_speed: Array) -> Array:

@@ -29,6 +29,7 @@ class Meeting:
     hit: Array = array()  # bool: there is one, or the contacts are those at the end
     fast: Array = array()  # bool: an impact that is not slow
     rests: Array = array("K")  # bool, of each contact: it touches from the start of the path on
+    feature: Any = array("K", default=None)  # of these contacts, as in `Contacts`
     level: Any = array(default=None)  # [m] gap at which they meet
     slack: Any = array(default=None)  # [m] contacts whose gaps differ by no more are simultaneous
     now: Any = array(default=None)  # bool: this impact is handled in this pass

@@ -22,6 +22,7 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from diffrigid.branches import any_world, choose
+from diffrigid.collide.contacts import transferred
 from diffrigid.contact.approach import (
     Polish,
     Task,
@@ -47,10 +48,10 @@ ADVANCING, NEARING, POLISHING, DONE = range(4)
 
 def approach_search(
     a: Side, b: Side, t1: Array, width: Array | None, rest_speed: Array, rested: Array, at_end: Array
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array | None]:
     """Search the next impact of any two shapes: its time, level of the gap, whether there is one, which contacts rest.
 
-    With `at_end`, a bool, nothing is searched. Only the level has a gradient.
+    And the features of these contacts. With `at_end`, a bool, nothing is searched. Only the level has a gradient.
     """
     task = task_of(a, b, t1, width, rest_speed, rested)
     search = _stage_by_stage if isinstance(b.shape, HalfSpace) else _in_one_loop
@@ -59,8 +60,8 @@ def approach_search(
     if width is not None:
         level = _differentiable(level, width, a, b, closest)
     s, (_, bound) = jnp.where(end.found, end.s, end.near), earliest(task.a, task.b)
-    rests = checkpoint_name(end.rests, FOUND)
-    return jnp.where(s < bound, task.start, s), level, end.found | end.inside, rests
+    rests, feature = checkpoint_name((end.rests, end.feature), FOUND)
+    return jnp.where(s < bound, task.start, s), level, end.found | end.inside, rests, feature
 
 
 @jax.custom_jvp
@@ -94,6 +95,7 @@ class Found(NamedTuple):
     found: Array  # (*batch) bool: some contact is at its level
     inside: Array  # (*batch) bool: some contact was within its level and closing there
     rests: Array  # (K, *batch) bool: contacts that rest, which are left out
+    feature: Array | None  # (K, *batch) of these contacts, as in `Contacts`
     closest: Closest | None  # None: exact
 
 
@@ -114,7 +116,7 @@ def _stage_by_stage(task: Task, start: Array, at_end: Array) -> Found:
     nothing = over & (level <= 0)
     s, look = _closed_in(task, near, level, rests, nothing | at_end)
     found = look.found(task) & ~nothing
-    return Found(s, near, level, found, look.inside & ~nothing, rests, None if task.width is None else nearest)
+    return Found(s, near, level, found, look.inside & ~nothing, rests, None, None if task.width is None else nearest)
 
 
 def _come_near(task: Task, start: Array, at_end: Array) -> tuple[Array, Array, Array]:
@@ -135,7 +137,7 @@ def _come_near(task: Task, start: Array, at_end: Array) -> tuple[Array, Array, A
         rests = jnp.where(count == 0, resting(task, gaps), rests)
         return count + 1, s, clear(gaps, rests, s), rests
 
-    first = (0, start, jnp.zeros_like(start), jnp.zeros((_count(task, start), *start.shape), bool))
+    first = (0, start, jnp.zeros_like(start), jnp.zeros(_look(task, start).gap.shape, bool))
     _, near, dt, rests = lax.while_loop(flying, advance, first)
     over = (near < task.t1) & safe(near, dt)
     return jnp.where(over, task.t1, near), over, rests
@@ -158,9 +160,9 @@ def _closed_in(task: Task, near: Array, level: Array, rests: Array, nothing: Arr
     return s, look
 
 
-def _count(task: Task, start: Array) -> int:
-    """Number of contacts."""
-    return len(jax.eval_shape(lambda: gaps_at(task.a, task.b, start).gap))
+def _look(task: Task, start: Array) -> Gaps:
+    """Shapes of a look."""
+    return jax.eval_shape(lambda: gaps_at(task.a, task.b, start))
 
 
 class Search(NamedTuple):
@@ -171,6 +173,7 @@ class Search(NamedTuple):
     tries: Array  # (*batch) int: looks in this stage
     s: Array  # (*batch) [s] of the next look; at last where they meet
     rests: Array  # (K, *batch), and so on as in `Found`
+    feature: Array | None
     near: Array
     found: Array
     inside: Array
@@ -179,14 +182,12 @@ class Search(NamedTuple):
 
 
 def _in_one_loop(task: Task, start: Array, at_end: Array) -> Found:
-    none, zero, no = (
-        jnp.zeros((_count(task, start), *start.shape), start.dtype),
-        jnp.zeros_like(start),
-        start < start,
-    )
+    look, zero, no = _look(task, start), jnp.zeros_like(start), start < start
+    none = jnp.zeros(look.gap.shape, bool)
+    feature = None if look.feature is None else jnp.zeros(look.feature.shape, look.feature.dtype)
     stage = jnp.full(start.shape, ADVANCING, np.int32)
     nearing = None if task.width is None else from_time(start)
-    first = Search(0, stage, jnp.zeros_like(stage), start, none > 0, start, no, no, zero, nearing)
+    first = Search(0, stage, jnp.zeros_like(stage), start, none, feature, start, no, no, zero, nearing)
     follow = _follower(task)
 
     def busy(now: Search) -> Array:
@@ -194,7 +195,7 @@ def _in_one_loop(task: Task, start: Array, at_end: Array) -> Found:
 
     end = lax.while_loop(busy, lambda now: follow(now, gaps_at(task.a, task.b, now.s)), first)
     nearest = None if end.nearing is None else end.nearing.closest()
-    return Found(end.s, end.near, end.level, end.found, end.inside, end.rests, nearest)
+    return Found(end.s, end.near, end.level, end.found, end.inside, end.rests, end.feature, nearest)
 
 
 def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
@@ -202,8 +203,10 @@ def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
     clear = clearance(task)
 
     def follow(now: Search, gaps: Gaps) -> Search:
-        rests = taking_over(task, gaps, jnp.where(now.count == 0, resting(task, gaps), now.rests))
-        now, rests = now._replace(count=now.count + 1, rests=rests), falling(task, gaps, rests, now.s)
+        before = transferred(now.rests, now.feature, gaps.feature)
+        rests = taking_over(task, gaps, jnp.where(now.count == 0, resting(task, gaps), before))
+        now = now._replace(count=now.count + 1, rests=rests, feature=gaps.feature)
+        rests = falling(task, gaps, rests, now.s)
         now = choose(now.stage == ADVANCING, _advanced(task, now, clear(gaps, rests, now.s)), now)
         following = choose(now.stage == POLISHING, _polished(task, now, gaps, rests), now)
         if task.width is None:

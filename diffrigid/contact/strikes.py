@@ -10,7 +10,7 @@ from jax import Array, lax
 
 from diffrigid.branches import any_world
 from diffrigid.collide import Contacts, PairGroup
-from diffrigid.collide.contacts import THERE
+from diffrigid.collide.contacts import THERE, transferred
 from diffrigid.collide.heights import height_over
 from diffrigid.collide.profile import clearance
 from diffrigid.contact.held_up import held_up, is_supported
@@ -157,12 +157,13 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     at_a, at_b = up.at_a, up.at_b
     contacts, moving = with_rates(a, at_a, b, at_b) if loaded else (contacts_of(a, at_a, b, at_b), None)
     gaps, apart = up.gaps(contacts), held | is_supported(a, b)  # else the two are where they strike
+    rests = transferred(meeting.rests, meeting.feature, contacts.feature)
     # Also contacts that opened because the body below fell away: they may close again once it is held, or struck.
     fall = dt**2 * sum(norm(at.a) for at in (at_a, at_b) if at.a is not None)
     opened = jnp.where((held | meeting.joins)[None] | rested, fall[None], 0.0)
     near = gaps <= (meeting.level + meeting.slack)[None] + opened
     there = gaps < THERE  # what rested may have left the face on which it did
-    active = (near | (meeting.rests & held[None])) & there & meeting.hit[None]
+    active = (near | (rests & held[None])) & there & meeting.hit[None]
     both_move = a.flight is not None and b.flight is not None
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
     size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
@@ -185,7 +186,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
             press=-dot(contact.normal, forces), pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip
 
-    return replace(jax.vmap(each)(contacts, moving, gaps), active=active, rests=meeting.rests)
+    return replace(jax.vmap(each)(contacts, moving, gaps), active=active, rests=rests)
 
 
 def relative_path_is_straight(world: "World", both_move: bool) -> bool:
