@@ -438,6 +438,27 @@ def test_equal_elastic_balls_exchange_their_motions():
     assert_allclose(jac[np.ix_(x, speeds)], 1.0 * exchange, atol=EXACT)  # times t = 1 s
 
 
+def test_two_walls_struck_at_once_need_not_be():
+    """A disc in a corner: what it does along one wall does not depend on when it strikes the other."""
+    e, disc = 0.8, dr.Body(dr.Disc(radius=0.1), mass=1.3, x=(0.11, 0.11), v=(-2.0, -2.0))
+    walls = {name: dr.Static(dr.HalfSpace(normal=n)) for name, n in (("left", (1.0, 0.0)), ("floor", (0.0, 1.0)))}
+    world, state = dr.scene({"disc": disc, **walls}, restitution=e)
+    slopes = jax.jit(jax.jacfwd(lambda x: dr.step(world, dr.replace(state, x=x), 1 / 60).x))(state.x)
+    assert_allclose(slopes.reshape(2, 2), -e * np.eye(2), atol=ROUNDING)
+
+
+def test_touching_balls_struck_just_where_a_step_ends():
+    """The last ball leaves by as much later as the first comes later; the others stay. All numbers are binary."""
+    x, v, dt, disc = (-9 / 32, 0.0, 1 / 4), 2.0, 1 / 64, dr.Disc(radius=1 / 8)
+    start = [{"x": (x_i, 0.0), "v": (v_i, 0.0)} for x_i, v_i in zip(x, (v, 0.0, 0.0), strict=True)]
+    world, state = dr.scene({f"ball{i}": dr.Body(disc, mass=1.0, **of) for i, of in enumerate(start)}, restitution=1.0)
+    first = jax.tree.map(jnp.zeros_like, state)
+    first = dr.replace(first, x=first.x.at[0, 0].set(1.0))
+    end, change = jax.jit(lambda *of: jax.jvp(lambda s: dr.step(world, s, dt), *((part,) for part in of)))(state, first)
+    assert_allclose(end.x[:, 0], (-1 / 4, 0.0, 1 / 4), atol=ROUNDING)
+    assert_allclose(change.x[:, 0], (0.0, 0.0, 1.0), atol=ROUNDING)
+
+
 @pytest.mark.slow
 def test_final_height_is_smooth_in_the_initial_height():
     """No sawtooth as the impact moves through the steps: a straight line of slope -1 without gravity, else a curve."""

@@ -15,7 +15,7 @@ from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.known import Known, beside, loads, reversing
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
 from diffrigid.contact.order import over_islands
-from diffrigid.contact.resting import Law, Strikes, barely, solve_impulses
+from diffrigid.contact.resting import Law, Strikes, are_alone, barely, solve_impulses
 from diffrigid.contact.rolling import beside_rolling, rolling_reversing, rolling_stops, with_rows
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
@@ -81,6 +81,8 @@ def apply_impulses(
     displacing = jnp.where(kick > 0, 0.5 * held_for, 1.0)[:, None] * P + early_P
     moved = velocities(mobility, *momentum_changes(strikes, displacing, moving))[:2]
     moved = _no_further_than_flown(flight, t, mobility, (dv, dw), moved, kick)
+    if not are_alone(strikes.a, strikes.b, moving):
+        moved = tuple(map(jnp.add, moved, _at_their_times(strikes, P, t, mobility, kick)))
     pushed = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
     kept = _no_faster_than_drift(mobility, pushed, strikes) + keeping_spin(
         strikes, drift_after(strikes, dv), early_P, moving
@@ -91,6 +93,17 @@ def apply_impulses(
     # The new path of a body that was held, followed backwards, agrees with its true path to second order.
     since = jnp.where(count > 0, jnp.where(holds, flight.t0, t), anchors.since)
     return _anchored(flight, t, q, since, kicked, moved), friction, load
+
+
+def _at_their_times(strikes: Strikes, P: Array, t: Array, mobility: Mobility, kick: Array) -> tuple[Array, Array]:
+    """Displacements and turns (N, ., *batch) by impacts P at their own times instead of t, the mean for each body.
+
+    The times are equal but for rounding. Their derivatives are not: two walls that are struck at once need not be.
+    """
+    P = jnp.where(strikes.held, 0.0, kick)[:, None] * P
+    late = -strikes.s[:, None] * P
+    (dv, dw), (dx, turn) = (velocities(mobility, *momentum_changes(strikes, each, len(t)))[:2] for each in (P, late))
+    return t[:, None] * dv + dx, t[:, None] * dw + turn
 
 
 def _no_further_than_flown(

@@ -259,8 +259,10 @@ def _held(
     u, least = -jax.vmap(dot)(strikes.normal, strikes.v_rel), world.contact.rest_speed[None]
     slow = u <= least
     comes = strikes.active & ~strikes.held & (slow | (strikes.now & stays))
-    # Where friction has slowed a body, other corners may touch at the end than those that were held.
-    touches = strikes.active & (resting | (jnp.abs(u) <= least)) & ~drives
+    # Where friction has slowed a body, other corners may touch at the end than those that were held. A contact that was
+    # struck just then parts: its gap is zero, but not what it depends on.
+    parts = (u < -least) & (strikes.gap >= -strikes.rounding)
+    touches = strikes.active & (resting | (jnp.abs(u) <= least)) & ~parts & ~drives
     held = jnp.where(phase == PUSH, touches, held)
     return held, jnp.where(impact, resting | held | comes, jnp.where(phase == REVERSE, resting, held))
 
