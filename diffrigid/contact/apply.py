@@ -19,10 +19,10 @@ from diffrigid.contact.resting import Law, Strikes, are_alone, barely, solve_imp
 from diffrigid.contact.rolling import beside_rolling, rolling_reversing, rolling_stops, with_rows
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
-from diffrigid.contact.sums import side_sum
+from diffrigid.contact.sums import at_colliders, body_sides, side_sum
 from diffrigid.elimination import islands
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
-from diffrigid.gathers import flags
+from diffrigid.gathers import flags, rows
 from diffrigid.linkage import Linkage, ends_of, linkage, spread
 from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.pytree import replace
@@ -80,7 +80,7 @@ def apply_impulses(
     # A force that has acted evenly has its centroid in the middle of its time, for which it displaces by P / m.
     displacing = jnp.where(kick > 0, 0.5 * held_for, 1.0)[:, None] * P + early_P
     moved = velocities(mobility, *momentum_changes(strikes, displacing, moving))[:2]
-    moved = _no_further_than_flown(flight, t, mobility, (dv, dw), moved, kick)
+    moved = _no_further_than_flown(flight, t, mobility, strikes, (dv, dw), moved, kick)
     if not are_alone(strikes.a, strikes.b, moving):
         moved = tuple(map(jnp.add, moved, _at_their_times(strikes, P, t, mobility, kick)))
     pushed = keeping_spin(strikes, strikes.drift, (1.0 - kick) * P, moving)
@@ -107,28 +107,40 @@ def _at_their_times(strikes: Strikes, P: Array, t: Array, mobility: Mobility, ki
 
 
 def _no_further_than_flown(
-    flight: Flight, t: Array, mobility: Mobility, by: tuple[Array, Array], moved: tuple[Array, Array], kick: Array
-) -> tuple[Array, Array]:
+    flight: Flight, t: Array, mobility: Mobility, strikes: Strikes, by: tuple[Array, Array],
+    moved: tuple[Array, Array], kick: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """Limit displacements (N, D, *batch) and turns (N, A, *batch) to the time times the speeds before and after.
 
-    They are half as large where all forces of a body have acted for one time. Where some have begun later, a light body
-    between heavy ones, on which these forces all but cancel, would be thrown off. A body with joints turns with its
-    linkage: its turn is limited as its displacement is.
+    Displacements: the speeds relative to the fastest that it touches, or else the change of its velocity. They are half
+    as large where all forces of a body have acted for one time. Where some have begun later, a light body between heavy
+    ones, on which these forces all but cancel, would be thrown off. A body with joints turns with its linkage: its
+    turn is limited as its displacement is, by its own speeds.
 
     Args:
         by: changes of v [m/s] and w [rad/s].
     """
     L = jax.vmap(angular_momentum)(flight, t)
-    before = jax.vmap(velocity)(flight, t), jax.vmap(rotations(flight.dim).apply)(mobility.inverse_inertia, L)
+    v, w = jax.vmap(velocity)(flight, t), jax.vmap(rotations(flight.dim).apply)(mobility.inverse_inertia, L)
+    v, w = (v, v + by[0]), (w, w + by[1])
+    joined = flags(tuple(i in mobility.joined for i in range(len(t))), t)
+    flown, turned = (sum(map(jax.vmap(norm), speeds)) for speeds in (v, w))
+    apart = jnp.maximum(sum(_speeds_apart(strikes, speeds) for speeds in v), jax.vmap(norm)(by[0]))
 
-    def share(speed: Array, change: Array, way: Array, least: float) -> Array:
-        most = (t - flight.t0) * (jax.vmap(norm)(speed) + jax.vmap(norm)(speed + change))
-        size = jax.vmap(norm)(way)
+    def share(speed: Array, way: Array, least: float) -> Array:
+        most, size = (t - flight.t0) * speed, jax.vmap(norm)(way)
         return jnp.where((kick > 0) & (size > most + least), safe_divide(most, size), 1.0)[:, None]
 
-    of_way, of_turn = (share(*each) for each in zip(before, by, moved, (0.0, LEAST_TURN), strict=True))
-    joined = flags(tuple(i in mobility.joined for i in range(len(t))), t)[:, None]
-    return of_way * moved[0], jnp.where(joined, of_way, of_turn) * moved[1]
+    of_way, of_turn = share(jnp.where(joined, flown, apart), moved[0], 0.0), share(turned, moved[1], LEAST_TURN)
+    return of_way * moved[0], jnp.where(joined[:, None], of_way, of_turn) * moved[1]
+
+
+def _speeds_apart(strikes: Strikes, v: Array) -> Array:
+    """Largest speed of each body relative to one that it touches, (N, *batch) [m/s], from velocities (N, D, *batch)."""
+    of_a, of_b = (at_colliders(v, side, 0.0) for side in (strikes.a, strikes.b))
+    speed = jnp.where(strikes.active, jax.vmap(norm)(of_a - of_b), 0.0)
+    padded = jnp.concatenate([speed, speed, jnp.zeros_like(speed[:1])])
+    return rows(padded, body_sides(strikes.a, strikes.b, len(v))).max(1)
 
 
 def _no_faster_than_drift(mobility: Mobility, dL: Array, strikes: Strikes) -> Array:
