@@ -25,7 +25,9 @@ TOP = 1e-6  # the same series as SPIN_SERIES at 3 rad/s and 1/240 s, over 3 s
 
 WORLDS, MIRRORED, SMOOTH, ELASTIC, LIVELY = 24, 4, 8, 16, 20
 # Of the 24 worlds, the first 8 have e = 1 without friction, the next 8 e = 1 with friction, then 4 with 0.3 < e < 1
-# and 4 with e < 0.1, where bodies stay together. Four more repeat the first ones of ELASTIC with bodies swapped.
+# and 4 with e < 0.1, where bodies stay together. Four more repeat the first ones of ELASTIC with bodies swapped, and
+# the last four those where bodies stay together, seen from a frame that moves.
+BOOST = np.array([3.0, -2.0, 1.0])  # [m/s]
 
 
 def crowd(p):
@@ -60,7 +62,9 @@ def starts(dim):
     twin = {name: values[SMOOTH : SMOOTH + MIRRORED] for name, values in p.items()}
     twin |= {name: twin[name][:, swap] for name in ("x", "v", "w", "q", "mass")}
     twin |= {"radius": twin["radius"][:, ::-1], "half": twin["half"][:, ::-1]}
-    return jax.tree.map(lambda *rows: jnp.asarray(np.concatenate(rows)), p, twin)
+    seen = {name: values[LIVELY:] for name, values in p.items()}
+    seen["v"] = seen["v"] + BOOST[:dim]
+    return jax.tree.map(lambda *rows: jnp.asarray(np.concatenate(rows)), p, twin, seen)
 
 
 def swapped(dim):
@@ -87,6 +91,17 @@ def test_crowds_meet(dim):
     struck = np.abs(states.v[:, -1] - states.v[:, 0]).max((1, 2)) > 0.1
     assert struck.mean() > 0.9
     assert (energy[LIVELY:WORLDS, -1] < 0.8 * energy[LIVELY:WORLDS, 0]).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_frame_that_moves_sees_the_same(dim):
+    states = crowds(dim)[0]
+    home, moved = (
+        jax.tree.map(lambda leaf, of=of: leaf[of], states) for of in (slice(LIVELY, WORLDS), slice(-4, None))
+    )
+    way = np.arange(91)[:, None, None] / 60 * BOOST[:dim]
+    for name, more in dict(x=way, q=0.0, v=BOOST[:dim], w=0.0).items():
+        assert_allclose(getattr(moved, name), np.asarray(getattr(home, name)) + more, atol=GROWN, err_msg=name)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -179,7 +194,7 @@ def test_what_is_round_and_smooth_strikes_as_if_it_did_not_spin(kind):
 def test_swapping_bodies_swaps_their_motions(dim):
     """Each pair then has its sides a and b exchanged."""
     states = crowds(dim)[0]
-    got = jax.tree.map(lambda leaf: leaf[WORLDS:], states)
+    got = jax.tree.map(lambda leaf: leaf[WORLDS : WORLDS + MIRRORED], states)
     expected = jax.tree.map(lambda leaf: leaf[SMOOTH : SMOOTH + MIRRORED][:, :, np.array(swapped(dim))], states)
     jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=GROWN, atol=GROWN), got, expected)
 
