@@ -3,7 +3,8 @@
     python experiments/depth.py [--sweeps 4] [--only plate]
 
 Rods and boxes fall into a right angle between two half-spaces, and plates of three thicknesses on a box; turned and
-spun at random, with restitution 0 or 0.3 and friction 0 or 0.2: 4 times 128 of each, a second and a half. What is
+spun at random, with restitution 0 or 0.3 and friction 0 or 0.2: 4 times 128 (plates: 32) of each, for a second and a
+half. What is
 struck more often than a step has sweeps ends it inside. Prints how many of each were ever deeper than a thousandth of
 their radius or half thickness, and the deepest, in per cent of it.
 """
@@ -17,7 +18,7 @@ import numpy as np
 
 import diffrigid as dr
 
-COUNT, SECONDS, THICK, LONG = 128, 1.5, 0.1, 0.35  # [m] half thickness, half length
+SECONDS, THICK, LONG = 1.5, 0.1, 0.35  # [m] half thickness, half length
 COEFFICIENTS = tuple(product((0.0, 0.3), (0.0, 0.2)))  # restitution, friction
 C = np.sqrt(0.5)
 
@@ -28,20 +29,20 @@ def valley(dim):
 
 
 BOX = {"box": dr.Static(dr.Box(half=(LONG, LONG, LONG)), x=(0.0, 0.0, -0.1))}
-# Dimensions, shape, its radius or half thickness, and what it falls on.
+# Number, dimensions, shape, its radius or half thickness, and what it falls on.
 SCENES = {
-    "rod, 2D": (2, dr.Capsule(radius=THICK, half_length=LONG - THICK), THICK, valley(2)),
-    "box, 2D": (2, dr.Box(half=(LONG, THICK)), THICK, valley(2)),
-    "rod, 3D": (3, dr.Capsule(radius=THICK, half_length=LONG - THICK), THICK, valley(3)),
-    "box, 3D": (3, dr.Box(half=(LONG, THICK, THICK)), THICK, valley(3)),
-} | {f"plate, {1000 * h:.0f} mm": (3, dr.Box(half=(LONG, 0.7 * LONG, h)), h, BOX) for h in (0.1, 0.035, 0.01)}
+    "rod, 2D": (128, 2, dr.Capsule(radius=THICK, half_length=LONG - THICK), THICK, valley(2)),
+    "box, 2D": (128, 2, dr.Box(half=(LONG, THICK)), THICK, valley(2)),
+    "rod, 3D": (128, 3, dr.Capsule(radius=THICK, half_length=LONG - THICK), THICK, valley(3)),
+    "box, 3D": (128, 3, dr.Box(half=(LONG, THICK, THICK)), THICK, valley(3)),
+} | {f"plate, {1000 * h:.0f} mm": (32, 3, dr.Box(half=(LONG, 0.7 * LONG, h)), h, BOX) for h in (0.1, 0.035, 0.01)}
 
 
-def starts(state, dim):
+def starts(state, count, dim):
     rng, so = np.random.default_rng(0), dr.state.rotations(dim)
-    x = np.asarray(state.x) + np.eye(dim)[0] * rng.uniform(-0.2, 0.2, (COUNT, 1, 1))
-    q = jax.vmap(so.exp)(jnp.asarray(rng.uniform(-np.pi, np.pi, (COUNT, so.A))))[:, None]
-    v, w = rng.uniform(-1.0, 1.0, x.shape), rng.uniform(-5.0, 5.0, (COUNT, 1, so.A))
+    x = np.asarray(state.x) + np.eye(dim)[0] * rng.uniform(-0.2, 0.2, (count, 1, 1))
+    q = jax.vmap(so.exp)(jnp.asarray(rng.uniform(-np.pi, np.pi, (count, so.A))))[:, None]
+    v, w = rng.uniform(-1.0, 1.0, x.shape), rng.uniform(-5.0, 5.0, (count, 1, so.A))
     return dr.State(**{name: jnp.asarray(leaf, state.x.dtype) for name, leaf in dict(x=x, q=q, v=v, w=w).items()})
 
 
@@ -53,7 +54,7 @@ def main():
     jax.config.update("jax_enable_x64", True)
     print(f"{'':12} steps/s  inside  of  deepest")
     kinds = {name: of for name, of in SCENES.items() if name.startswith(options.only)}
-    for (name, (dim, shape, thick, ground)), rate in product(kinds.items(), (60, 240)):
+    for (name, (count, dim, shape, thick, ground)), rate in product(kinds.items(), (60, 240)):
         deepest, level = [], (0.0,) * (dim - 2)
         for restitution, friction in COEFFICIENTS:
             world, state = dr.scene(
@@ -63,7 +64,7 @@ def main():
                 friction=friction,
                 contact=dr.Contact(sweeps=options.sweeps),
             )
-            states = dr.rollout_batch(world, starts(state, dim), dt=1 / rate, steps=int(SECONDS * rate))
+            states = dr.rollout_batch(world, starts(state, count, dim), dt=1 / rate, steps=int(SECONDS * rate))
 
             def gap(state, world=world, ground=tuple(ground)):
                 return jnp.stack([dr.gap(world, state, "body", side) for side in ground]).min(0)

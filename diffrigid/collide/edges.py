@@ -130,7 +130,7 @@ def _order(c: Crossing, separated: Array, slack: Array, deepest: Array) -> Array
     apart = c.distance > slack
     outermost = c.within & (c.lowest >= -slack)
     separated = separated | (outermost & apart).any((0, 1))
-    deepest = jnp.minimum(deepest, jnp.where(outermost & ~apart, c.distance, jnp.inf).min((0, 1)))
+    deepest = jnp.minimum(deepest, jnp.where(outermost & ~apart, c.distance, jnp.inf).min((0, 1), keepdims=True))
     touches = are_outermost(c, deepest, slack) & ~separated[None, None]
     return jnp.where(c.within & (apart | touches), jnp.abs(c.distance), FAR)
 
