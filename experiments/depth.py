@@ -3,10 +3,9 @@
     python experiments/depth.py [--sweeps 4] [--only plate]
 
 Rods and boxes fall into a right angle between two half-spaces, and plates of three thicknesses on a box; turned and
-spun at random, with restitution 0 or 0.3 and friction 0 or 0.2: 4 times 128 (plates: 32) of each, for a second and a
-half. What is
-struck more often than a step has sweeps ends it inside. Prints how many of each were ever deeper than a thousandth of
-their radius or half thickness, and the deepest, in per cent of it.
+spun at random, with restitution 0 or 0.3 and friction 0 or 0.2: 4 times 128 of each, of plates 4 times 32, for a second
+and a half. What is struck more often than a step has sweeps ends it inside. Prints how many of each were ever deeper
+than a thousandth of their radius or half thickness, and the deepest, in per cent of it.
 """
 
 import argparse
