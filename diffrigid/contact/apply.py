@@ -14,15 +14,15 @@ from jax import Array, lax
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.known import Known, beside, loads, reversing
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
-from diffrigid.contact.order import over_islands
+from diffrigid.contact.order import Links, over_islands
 from diffrigid.contact.resting import Law, Strikes, are_alone, barely, solve_impulses
 from diffrigid.contact.rolling import beside_rolling, rolling_reversing, rolling_stops, with_rows
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
-from diffrigid.contact.sums import at_colliders, body_sides, side_sum
+from diffrigid.contact.sums import at_colliders, side_sum
 from diffrigid.elimination import islands
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
-from diffrigid.gathers import flags, rows
+from diffrigid.gathers import flags
 from diffrigid.linkage import Linkage, ends_of, linkage, spread
 from diffrigid.numerics import norm, safe_divide, safe_sqrt
 from diffrigid.pytree import replace
@@ -139,8 +139,7 @@ def _speeds_apart(strikes: Strikes, v: Array) -> Array:
     """Largest speed of each body relative to one that it touches, (N, *batch) [m/s], from velocities (N, D, *batch)."""
     of_a, of_b = (at_colliders(v, side, 0.0) for side in (strikes.a, strikes.b))
     speed = jnp.where(strikes.active, jax.vmap(norm)(of_a - of_b), 0.0)
-    padded = jnp.concatenate([speed, speed, jnp.zeros_like(speed[:1])])
-    return rows(padded, body_sides(strikes.a, strikes.b, len(v))).max(1)
+    return Links(strikes.a, strikes.b, tuple((i,) for i in range(len(v)))).of_bodies(jnp.max, speed, 0.0)
 
 
 def _no_faster_than_drift(mobility: Mobility, dL: Array, strikes: Strikes) -> Array:
