@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid.contact import isolated
+from diffrigid.contact.blocks import blocks_of, grouped, of_all, soonest, sum_of_met, where_allowed
+from diffrigid.contact.slots import Table
 from diffrigid.scan import MEMORY
 
 STEPS = 24
@@ -131,3 +133,24 @@ def test_more_discs_than_sweeps_strike_one_floor_in_a_step():
     assert isolated.goes_in_rounds(world) and world.contact.sweeps < 6
     end = dr.rollout(world, state, dt=dt, steps=1).state
     assert_allclose(end.x[-1, :, 1] - 0.1, 0.5 * (speed * dt - gap), rtol=1e-12)
+
+
+@pytest.mark.parametrize("moving", [2, 3, 6, 8])
+def test_blocks_hold_each_two_bodies(moving):
+    """The first that each meets, and the sum of all until a time, are those of a table in which two cannot meet."""
+    rng, others = np.random.default_rng(moving), tuple(range(moving))
+    table = rng.permutation(moving**2).reshape(moving, moving) + 1.0
+    table = np.minimum(table, table.T)
+    allowed = (table < table.max()) & ~np.eye(moving, dtype=bool)
+    table = np.where(np.eye(moving, dtype=bool), np.inf, table)
+    of_pairs = Table(None, others, others, others, tuple(map(tuple, allowed.astype(float))))
+    until, first, met = rng.integers(1, moving**2, (moving, 1)).astype(float), [], []
+    for block in blocks_of(of_pairs, moving):
+        assert all((a == b).all() for a, b in zip(grouped(block, jnp.arange(moving)), block[:2], strict=True))
+        times = jnp.array(table)[block.a[:, :, None], block.b[:, None], None]
+        times = where_allowed(of_pairs, block, times)
+        first.append(of_all(soonest(block, times)))
+        met.append(of_all(sum_of_met(block, 100, times, jnp.array(until))))
+    expected = np.where(allowed, table, np.inf)
+    assert (np.min(first, 0)[:, 0] == expected.min(1)).all()
+    assert (np.sum(met, 0)[:, 0] == np.where(expected <= until, 100.0 + np.arange(moving), 0.0).sum(1)).all()

@@ -19,6 +19,7 @@ from jax import Array, lax
 from diffrigid.branches import any_world
 from diffrigid.collide import PairGroup
 from diffrigid.contact.anchors import Anchors
+from diffrigid.contact.blocks import Block, blocks_of, grouped, of_all, soonest, sum_of_met, where_allowed
 from diffrigid.contact.impact import approach, closed_form, meet_on_parabola
 from diffrigid.contact.impulse import comes_to_rest, restitution_at
 from diffrigid.contact.materials import materials, mixed
@@ -115,28 +116,24 @@ def next_impacts(world: "World", tables: tuple[Table, ...], flight: Flight, sinc
     tie = (jnp.sqrt(jnp.finfo(dt.dtype).eps) * dt)[None]
     many = 1 + max(max(table.b) for table in tables)
 
-    def first_of(times):
-        soonest = [fold(jnp.minimum, t, axis=1) for t in times]
-        return functools.reduce(jnp.minimum, soonest)
+    def over_blocks(reduce: Any, each: Any, *args: Array) -> Array:
+        halves = [unfused(functools.partial(each, block), t, *args) for block, t in times]
+        return functools.reduce(reduce, map(of_all, halves))
 
-    def with_what(times, first):
-        """Index of the collider that a body meets first; `many` or more if it meets two then."""
-        total = jnp.full_like(first, -many)
-        for table, t in zip(tables, times, strict=True):
-            for k, b in enumerate(table.b):
-                total = total + jnp.where(t[:, k] <= first + tie, float(many + b), 0.0)
-        return total
+    def with_what(block: Block, times: Array, first: Array) -> list[Array]:
+        return sum_of_met(block, many, times, first + tie)
 
-    def in_slots(first, other):
+    def in_slots(first: Array, total: Array) -> tuple:
+        other = total - many  # `many` or more if a body meets two at once
         hit = first <= dt[None]
         lead = (hit & (other > lax.broadcasted_iota(other.dtype, other.shape, 0))).astype(other.dtype)
         alone = fold(jnp.logical_and, ~hit | ((other < many) & (first > RESTS)), 0)
         return lead, jnp.where(hit, other, -1.0), ~alone
 
     # Not fused: times are compared with each other, and must not be computed twice with different rounding.
-    times = [_times(world, table, flight, since, dt) for table in tables]
-    first = unfused(first_of, times)
-    lead, other, crossed = unfused(in_slots, first, unfused(with_what, times, first))
+    times = [each for table in tables for each in _times(world, table, flight, since, dt)]
+    first = over_blocks(jnp.minimum, soonest)
+    lead, other, crossed = unfused(in_slots, first, over_blocks(jnp.add, with_what, first))
     before = constant(tuple(tuple(float(i < j) for j in range(moving)) for i in range(moving)), str(dt.dtype))
     rank = sum_of_terms(lax.expand_dims(before, range(2, 1 + lead.ndim)), lead[:, None], 0)[:, 0]
     needed = fold(jnp.add, lead, 0)
@@ -191,16 +188,22 @@ def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Ar
     return Slots(a, unfused(of_b, *unfused(sides, a, following), following))
 
 
-def _times(world: "World", table: Table, flight: Flight, since: Array, dt: Array) -> Array:
-    """Times of the next impacts (A, B, *batch) [s]; inf: none in this step; RESTS: without rebound."""
+def _times(world: "World", table: Table, flight: Flight, since: Array, dt: Array) -> list[tuple[Block, Array]]:
+    """Times of the next impacts (G, A, B, *batch) [s]; inf: none in this step; RESTS: without rebound."""
     a, b = sides_of_table(world, table, flight, since)
-    if table.b[0] < a.flight.t0.shape[0]:
-        return _times_of_pairs(world, table, a, since, dt)
-    return unfused(functools.partial(_times_to_statics, world, table), a, b, dt)
+    moving = len(a.flight.t0)
+    if table.b[0] < moving:
+        return [(block, where_allowed(table, block, t)) for block, t in _times_of_pairs(world, table, a, since, dt)]
+    (block,) = blocks_of(table, moving)
+
+    def to_statics(a: Side, b: Side, dt: Array) -> Array:
+        return where_allowed(table, block, _times_to_statics(world, table, a, b, dt)[None])
+
+    return [(block, unfused(to_statics, a, b, dt))]
 
 
-def _times_of_pairs(world: "World", table: Table, bodies: Side, since: Array, dt: Array) -> Array:
-    """Time of the next impact of each two bodies, (N, N, *batch) [s]: `meet_on_line`, without derivatives."""
+def _times_of_pairs(world: "World", table: Table, bodies: Side, since: Array, dt: Array) -> list[tuple[Block, Array]]:
+    """Times of the next impact of each two bodies, (G, A, B, *batch) [s]: `meet_on_line`, without derivatives."""
 
     def at_start(flight: Flight) -> tuple[Array, Array]:
         zero = jnp.zeros_like(flight.t0)
@@ -218,22 +221,24 @@ def _times_of_pairs(world: "World", table: Table, bodies: Side, since: Array, dt
         rests = (root <= world.contact.rest_speed * R) & (s <= dt)
         return jnp.where(rests, RESTS, s)
 
+    def of_block(block: Block, lines: tuple) -> Array:
+        a, b = zip(*(grouped(block, leaf) for leaf in lines), strict=True)
+        return jax.vmap(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(a, b)
+
     lines = (*unfused(at_start, bodies.flight), bodies.flight.t0, since, bodies.shape.radius)
-    return _allowed(table, unfused(jax.vmap(jax.vmap(one, (None, 0)), (0, None)), lines, lines))
+    return [(block, unfused(functools.partial(of_block, block), lines)) for block in blocks_of(table, len(since))]
 
 
 def _times_to_statics(world: "World", table: Table, a: Side, b: Side, dt: Array) -> Array:
     """Time of the next impact of each body with each static, (N, B, *batch) [s]."""
     if isinstance(b.shape, HalfSpace):
-        times = _times_to_planes(world, table, a, b, dt)
-    else:
+        return _times_to_planes(world, table, a, b, dt)
 
-        def one(a: Side, b: Side) -> Array:
-            s, _, found, u = approach(a, b, None)
-            return jnp.where(found, jnp.where((u <= world.contact.rest_speed) & (s <= dt), RESTS, s), jnp.inf)
+    def one(a: Side, b: Side) -> Array:
+        s, _, found, u = approach(a, b, None)
+        return jnp.where(found, jnp.where((u <= world.contact.rest_speed) & (s <= dt), RESTS, s), jnp.inf)
 
-        times = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(a, b)
-    return _allowed(table, times)
+    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(a, b)
 
 
 def _times_to_planes(world: "World", table: Table, a: Side, b: Side, dt: Array) -> Array:
@@ -260,12 +265,3 @@ def _times_to_planes(world: "World", table: Table, a: Side, b: Side, dt: Array) 
     n, offset, law = unfused(planes, b, own, others)
     bodies = (f.x, f.v, f.a, f.t0, a.since, a.shape.radius)
     return jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, 0))(bodies, (n, offset), law)
-
-
-def _allowed(table: Table, times: Array) -> Array:
-    """The times (N, B, *batch), inf where the two cannot meet."""
-    pairs = ((i, j, allowed) for i, row in enumerate(table.allowed) for j, allowed in zip(table.b, row, strict=True))
-    if all(allowed or i == j for i, j, allowed in pairs):
-        return times
-    allowed = constant(table.allowed, str(times.dtype))
-    return jnp.where(lax.expand_dims(allowed, range(2, times.ndim)) > 0, times, jnp.inf)
