@@ -96,6 +96,7 @@ def test_other_worlds_change_nothing(made, both):
             assert_allclose(getattr(both, name)[k], getattr(alone, name), atol=ROUNDING, err_msg=name)
 
 
+@pytest.mark.slow
 def test_final_state_is_the_last(many):
     _, _, worlds, states, _, _ = many
     last = dr.rollout_batch(worlds, states, dt=1 / 60, steps=40, final_only=True)

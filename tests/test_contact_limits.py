@@ -179,6 +179,7 @@ def box_on_floor(seconds, half, x, v, e, mu, w=(0.0, 0.0, 0.0)):
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
+@pytest.mark.slow
 def test_flat_box_rebounds_flat_and_then_rests_in_space():
     """Four corners at once; between the first two impacts, and long after the last."""
     speed, hit = fall(0.2, -1.0, G)

@@ -481,6 +481,7 @@ def test_a_disc_slides_into_a_slope():
     assert_allclose(found[1], 0.5 * (v * np.cos(angle) + speed) * left, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_ball_that_rests_is_struck():
     """From above and aside, so that it hits the floor at once: slopes by aim, speed and law are those of differences."""
 

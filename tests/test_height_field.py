@@ -205,6 +205,7 @@ def test_slopes_by_the_heights_are_those_of_differences():
         assert_allclose(by_height.reshape(3, -1)[:, k], difference, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_ball_slides_along_a_valley_and_keeps_its_energy():
     """Between two slopes, downhill, without friction: the acceleration is that along the valley."""
     valley = np.abs(X - 2.0) - 0.2 * Y

@@ -222,6 +222,7 @@ def test_a_joint_of_others_changes_nothing():
     assert_allclose(beside, alone, atol=1e-4)  # the free motion is integrated where there are joints
 
 
+@pytest.mark.slow
 def test_an_arm_falls_on_the_floor_and_rests():
     """Two boxes and a hinge: the hinge holds, and energy never rises by more than to lift them by g dt^2 / 8.
 

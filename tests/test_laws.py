@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_form import bouncing, disc_and_plane, final, made, simulated, steps_near, two_discs, vector, with_slopes
+from marks import some_later
 from motions import sums
 from numpy.testing import assert_allclose
 
@@ -93,7 +94,7 @@ def test_crowds_meet(dim):
     assert (energy[LIVELY:WORLDS, -1] < 0.8 * energy[LIVELY:WORLDS, 0]).all()
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@some_later("dim", [2, 3], 3)
 def test_a_frame_that_moves_sees_the_same(dim):
     states = crowds(dim)[0]
     home, moved = (

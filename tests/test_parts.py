@@ -35,6 +35,7 @@ def cut(half, turned):
     return {"left": dr.Part(dr.Box(half=part), x=-away), "right": dr.Part(dr.Box(half=swapped), x=away, **turned)}
 
 
+@pytest.mark.slow
 def test_a_box_cut_in_two_moves_as_one():
     parts = cut((0.3, 0.1), {"angle": np.pi / 2})
     one, two = (

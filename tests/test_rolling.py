@@ -132,6 +132,7 @@ def test_a_ball_on_a_plane():
         assert_allclose(slope[np.array([5, 6, 4]), 1], jax.jacfwd(spins, (0, 1, 2))(*row), atol=EXACT, err_msg=name)
 
 
+@pytest.mark.slow
 def test_an_impact_stops_some_of_the_turning():
     """By at most the coefficient times the normal impulse."""
 

@@ -337,6 +337,7 @@ def test_noise_that_is_given_does_not_change_a_score(records):
     assert_allclose([held.score(other)["p.x"] for other in (known, alike)], held.score(records[:1])["p.x"], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_fit_moves_as_it_was_fitted():
     """With the smooth impacts of its world, or of its last width: a near miss at a width of 0.1 m."""
     disc = dr.Disc(radius=0.2)
@@ -588,6 +589,7 @@ def test_values_that_fit_as_well_beyond_another_valley_are_in_the_note_of_a_prof
     assert found.apart == [0.0] and found.note == "profile, 0 fits as well"
 
 
+@pytest.mark.slow
 def test_a_late_clock_is_felt_across_an_impact():
     """A ball falls from 1 m (its centre 0.1 m above the floor at the impact) and comes back with 0.8 of its speed."""
     ball = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0))

@@ -51,6 +51,7 @@ def test_jit_is_no_jit():
         assert_same(dr.step(world, state, 1 / 60), compiled, ROUNDING)
 
 
+@pytest.mark.slow
 def test_what_reverse_mode_saves():
     """The passes of all steps, or only the states between them, as memory allows: the same slopes."""
     world, state = floats(*made(disc_and_plane, RUB))
@@ -78,6 +79,7 @@ def test_batch_is_loop(axis):
     assert_same(together, jax.tree.map(lambda *leaves: jnp.stack(leaves, axis), *alone), ROUNDING)
 
 
+@pytest.mark.slow
 def test_vmap_keeps_branches():
     """One that no world needs is left out, forward and in reverse mode; else vmap would compute every one for all."""
 

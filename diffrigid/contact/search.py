@@ -61,7 +61,11 @@ def approach_search(
         level = _differentiable(level, width, a, b, closest)
     s, (_, bound) = jnp.where(end.found, end.s, end.near), earliest(task.a, task.b)
     rests, feature = checkpoint_name((end.rests, end.feature), FOUND)
-    return jnp.where(s < bound, task.start, s), level, end.found | end.inside, rests, feature
+    inside = end.inside
+    if width is not None:
+        # What turns round within the level of a smooth impact waits for the next path: its time has no derivative.
+        inside = inside & ((width <= 0) | (s <= task.start))
+    return jnp.where(s < bound, task.start, s), level, end.found | inside, rests, feature
 
 
 @jax.custom_jvp
