@@ -167,6 +167,8 @@ def _gravities(world: World) -> list[str]:
 
 def component(path: str) -> tuple[str, int | None]:
     """Path of the whole and index: "ball.v[0]" is ("ball.v", 0), "ball.v" is ("ball.v", None)."""
+    if not isinstance(path, str):
+        raise ValueError(f"path is {path!r}: expected the name of a parameter, such as 'ball.v'")
     match = re.fullmatch(r"(.+)\[(\d+)\]", path, re.DOTALL)
     return (match[1], int(match[2])) if match else (path, None)
 

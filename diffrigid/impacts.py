@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from diffrigid.convert import numbers
 from diffrigid.hull import hull_faces
 from diffrigid.impulses import Changes, changes_of, impulses_at
 from diffrigid.pytree import replace
@@ -102,7 +103,7 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
         times: (F,) [s] resting contacts are given only for intervals that begin then; default all.
 
     Raises:
-        ValueError: not what `rollout` returns, traced, or a batch.
+        ValueError: not what `rollout` returns, traced, or a batch; times that are not numbers.
 
     Example:
         >>> bounce = dr.contacts(trajectory)
@@ -112,6 +113,8 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
         [[0.0, 7.56]]
     """
     checked(trajectory)
+    if times is not None:
+        numbers("times", times, None)  # checked, but used in double precision
     world, dim = trajectory.world, trajectory.world.dim
     names = world.names + world.static_names
     some = _thinned(trajectory)
@@ -132,7 +135,8 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     impact = touch.new | rough
     drawn = np.ones(len(touch.s), bool)
     if times is not None:
-        drawn = np.isin(touch.interval, np.searchsorted(motion.t, times - 0.5 * np.diff(motion.t).min()))
+        begins = np.asarray(times, float) - 0.5 * np.diff(motion.t).min()
+        drawn = np.isin(touch.interval, np.searchsorted(motion.t, begins))
     kept = (size > 1e-6 * size.max()) & (impact | drawn)
     t = motion.t[touch.interval] + touch.s
     kept = np.flatnonzero(kept)[np.argsort(t[kept], kind="stable")]

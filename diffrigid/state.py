@@ -5,7 +5,7 @@ x is the centre of mass, in the world frame; v and w are in the world frame. Not
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import TypeVar, cast
 
@@ -94,6 +94,7 @@ def _of_each(of_one: F) -> F:
     @functools.wraps(of_one)
     def of_all(*args: object, **named: object) -> Array:
         given = signature.bind(*args, **named).arguments
+        _check_kinds(given)
         if "state" not in given or not _times_first(given["state"]):
             return of_one(*args, **named)
         return jax.vmap(lambda state: of_all(**given | {"state": state}))(given["state"])
@@ -172,6 +173,13 @@ def _times_first(state: State) -> bool:
     sizes = [tuple(axis_sizes(dim)[letter] for letter in "DQA") for dim in (2, 3)]
     own, last = (tuple(shape[axis] for shape in shapes if len(shape) > 2) for axis in (1, -1))
     return last in sizes and own not in sizes
+
+
+def _check_kinds(given: Mapping[str, object]) -> None:
+    """Raise ValueError unless the arguments `bodies` and `state` are such records."""
+    for name, kind, source in (("bodies", Bodies, "world.bodies"), ("state", State, "a State, as `scene` makes it")):
+        if name in given and not isinstance(given[name], kind):
+            raise ValueError(f"{name} is a {type(given[name]).__name__}: expected {source}")
 
 
 def _check_sizes(state: State, dim: int, count: int) -> None:

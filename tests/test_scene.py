@@ -124,6 +124,14 @@ RUNS = {
     "one time": (r"times has shape \(1,\)", lambda w, s: dr.rollout(w, s, dt=0.1, times=(0.0,))),
     "exchanged": (r"expected \(world, state\)", lambda w, s: dr.step(s, w, 0.1)),
     "unknown path": (r"no parameter 'ball\.mas' .* did you mean 'ball\.mass'", lambda w, s: read(w, s, "ball.mas")),
+    "no path": (r"path is 3: expected the name of a parameter", lambda w, s: read(w, s, 3)),
+    "energy of a world": (r"bodies is a World: expected world\.bodies", lambda w, s: dr.kinetic_energy(w, s)),
+    "momentum exchanged": (r"bodies is a State: expected world\.bodies", lambda w, s: dr.momentum(s, w.bodies)),
+    "point of no state": (r"state is a NoneType: expected a State", lambda *_: dr.material_point(None, 0, np.zeros(2))),
+    "contacts at a name": (
+        "times is 'impact': expected numbers",
+        lambda w, s: dr.contacts(dr.rollout(w, s, dt=0.1, steps=1), times="impact"),
+    ),
     "path of wrong shape": (r"ball\.v.*shape \(3,\): expected", lambda w, s: write(w, s, "ball.v", jnp.zeros(3))),
     "state of another dimension": (
         r"state\.x has shape \(1, 3\), expected \(N=1, D=2, \*batch\)",
