@@ -95,7 +95,7 @@ def find_impact(
     slope = lax.stop_gradient(share * (gap_rates(contacts, *along) + turning)).sum(0)
     s = implicit_root(s0, (share * gaps).sum(0) - level, slope)
     # A contact that is inside where the paths begin is struck there, whatever its gap; one that turns round inside, and
-    # closes again, where it is found: neither is where a gap vanishes.
+    # closes again, where it is found (exact impacts only): neither is where a gap vanishes.
     inside = closes & (gap < lax.stop_gradient(level - slack)[None])
     s = jnp.where(inside.any(0) & ~there.any(0), jnp.where(s0 < t1, s0, t1), s)
     s = jnp.where(inside.any(0) & (s0 <= begin), begin, s)

@@ -189,7 +189,7 @@ def fill_slots(tables: tuple[Table, ...], count: int, following: Next, begin: Ar
 
 
 def _times(world: "World", table: Table, flight: Flight, since: Array, dt: Array) -> list[tuple[Block, Array]]:
-    """Times of the next impacts (G, A, B, *batch) [s]; inf: none in this step; RESTS: without rebound."""
+    """Times of the next impacts by blocks, (G, A, B, *batch) [s]; inf: none in this step; RESTS: without rebound."""
     a, b = sides_of_table(world, table, flight, since)
     moving = len(a.flight.t0)
     if table.b[0] < moving:
@@ -203,7 +203,7 @@ def _times(world: "World", table: Table, flight: Flight, since: Array, dt: Array
 
 
 def _times_of_pairs(world: "World", table: Table, bodies: Side, since: Array, dt: Array) -> list[tuple[Block, Array]]:
-    """Times of the next impact of each two bodies, (G, A, B, *batch) [s]: `meet_on_line`, without derivatives."""
+    """Times of the next impact of each two bodies by blocks, as `_times`: `meet_on_line`, without derivatives."""
 
     def at_start(flight: Flight) -> tuple[Array, Array]:
         zero = jnp.zeros_like(flight.t0)
