@@ -65,7 +65,7 @@ def separation(a: Outline, b: Outline) -> float:
     n = directions[length > 1e-12 * scale] / length[length > 1e-12 * scale, None]
     n = np.concatenate([n, -n])
     apart = (a.corners @ n.T).min(0) - (b.corners @ n.T).max(0)
-    return apart.max(initial=-scale) - a.rounding - b.rounding
+    return (apart.max() if len(n) else 0.0) - a.rounding - b.rounding  # two points at one place
 
 
 def _directions(a: Outline, b: Outline) -> np.ndarray:

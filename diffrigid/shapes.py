@@ -22,6 +22,7 @@ _CUBE = tuple((*corner, z) for z in (-1, 1) for corner in _SQUARE)
 _CUBE_EDGES = tuple(  # corners that differ in one sign
     (i, j) for i, j in itertools.combinations(range(8), 2) if np.dot(_CUBE[i], _CUBE[j]) == 1
 )
+_CUBE_FACES = ((0, 3, 2), (4, 5, 6), (0, 1, 5), (1, 2, 6), (2, 3, 7), (3, 0, 4))
 _BESIDE = {*_CUBE_EDGES, *((j, i) for i, j in _CUBE_EDGES)}
 
 
@@ -233,6 +234,19 @@ def edges(shape: Shape, dim: int) -> tuple:
     if isinstance(shape, Box) and dim == 3:
         return _CUBE_EDGES
     return _topology(shape)[1] if isinstance(shape, Hull) else ()
+
+
+def faces(shape: Shape, dim: int) -> tuple:
+    """For each face of the core, `dim` of its `vertices`, counter-clockwise seen from outside; static.
+
+    In 2D the segment of a capsule has two; in 3D it has none, like the point of a disc or sphere.
+    """
+    if isinstance(shape, Hull):
+        return _topology(shape)[0]
+    if dim == 3:
+        return _CUBE_FACES if isinstance(shape, Box) else ()
+    count = len(vertices(shape, dim))
+    return tuple((k, (k + 1) % count) for k in range(count)) if count > 1 else ()
 
 
 def edge_apexes(shape: Shape, dim: int) -> tuple:

@@ -12,8 +12,9 @@ from numpy.testing import assert_allclose
 import diffrigid as dr
 from diffrigid import so3
 from diffrigid.collide import COLLIDERS, CONVEX_2D, CONVEX_3D
+from diffrigid.collide.penetration import core_separation
 from diffrigid.overlap import outlines, place, separation
-from diffrigid.shapes import with_topology
+from diffrigid.shapes import radius, with_topology
 from diffrigid.state import rotations
 
 POSES = 24
@@ -104,6 +105,40 @@ def test_pair(dim, kind_a, kind_b):
             continue  # near an edge the point inside may be closer to another face
         speck = place(dr.Disc(radius=0.0) if dim == 2 else dr.Sphere(radius=0.0), point[k], q_a[k])
         assert_allclose(separation(speck, place(b, x_b[k], q_b[k])), 0.5 * gap[k], atol=1e-7)
+
+
+SOLID = [(dim, a, b) for dim, a, b in PAIRS if {a, b} & {dr.Box, dr.Polygon, dr.Hull} and b is not dr.HalfSpace]
+SOLID += [(2, dr.Capsule, dr.Capsule)]
+
+
+@pytest.mark.parametrize(("dim", "kind_a", "kind_b"), SOLID, ids=lambda p: getattr(p, "__name__", f"{p}D"))
+def test_overlapping_cores_are_as_deep_as_the_least_translation_that_parts_them(dim, kind_a, kind_b):
+    (a, x_a, q_a), (b, x_b, q_b), _ = poses(dim, kind_a, kind_b)
+    x_a = 0.1 * x_a
+    rounding = float(radius(a) + radius(b))
+    expected = np.array([distance(dim, a, x_a[k], q_a[k], b, q_b[k]) for k in range(POSES)]) + rounding
+    assert (expected < 0).sum() > POSES / 2
+
+    def cores(x_a, q_a, x_b, q_b):
+        contact = core_separation(a, x_a, q_a, b, x_b, q_b)
+        return contact.gap[0], contact.normal[0]
+
+    (gap, normal), slope = jax.jit(jax.vmap(lambda *p: (cores(*p), jax.grad(lambda *p: cores(*p)[0])(*p))))(
+        x_a, q_a, x_b, q_b
+    )
+    assert_allclose(np.minimum(gap, 0.0), np.minimum(expected, 0.0), atol=ROUNDING)
+    assert_allclose(slope, normal, atol=1e-7)
+
+
+@pytest.mark.parametrize("shift", [-1e-3, 1e-3])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_capsules_that_meet_end_on_end_touch_once(dim, shift):
+    """Also where one is a little beyond the end of the other: there is one contact, with or without a slip past it."""
+    rod, up = shape_of(dim, dr.Capsule), jnp.eye(dim)[1]
+    upright = jnp.array([0.0, 1.0] if dim == 2 else [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+    x = jnp.eye(dim)[0] * (rod.half_length + shift) + up * (rod.half_length + 2 * rod.radius)
+    contacts = COLLIDERS[dr.Capsule, dr.Capsule](rod, x, upright, rod, jnp.zeros(dim), jnp.eye(len(upright))[0])
+    assert (contacts.gap < 1e-2).sum() == 1
 
 
 @pytest.mark.parametrize(("dim", "kind"), [(dim, kind) for dim in SHAPES for kind in SHAPES[dim]])

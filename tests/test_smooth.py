@@ -210,6 +210,55 @@ def test_corners_that_turn_round_within_the_level_have_slopes():
     assert_allclose(slopes, (high - low) / 2e-6, atol=1e-7)
 
 
+TUMBLING = np.array(  # place of the second box, orientations, velocity of the second, spins
+    [
+        [-0.17, -0.35, 0.08, -0.65, 1.3, -0.1, -0.7, 0.75, 0.7, 1.5, -1.0, 1.3, 1.7, -0.8, -1.6, -0.6, -3.2, 7.1, 6.4, 1.2],
+        [-0.19, -0.27, 0.19, 0.05, 0.3, 1.3, -1.4, -2.1, 1.8, 1.4, 0.2, 1.5, 1.3, -1.4, -3.6, 8.1, 1.7, 6.6, 2.4, 0.7],
+        [-0.28, -0.02, 0.14, -0.05, -1.2, 0.2, -0.6, -0.75, 1.9, -1.3, 1.7, 3.3, -0.7, -1.7, -2.3, -3.6, 7.0, -0.5, 4.6, 2.3],
+        [-0.27, -0.22, 0.23, 1.7, -0.6, 0.0, 0.2, 0.35, 0.0, 0.3, -0.2, 2.9, 1.1, -1.7, -1.5, -1.3, 0.8, -0.1, -1.9, -1.0],
+    ]
+)  # fmt: skip
+
+
+def test_boxes_whose_paths_sink_into_each_other_have_slopes():
+    """Where the predicted paths come closest, other corners and crossings touch than before; their depth has no jumps."""
+    box = dr.Box(half=(0.2, 0.15, 0.1))
+    bodies = {"a": dr.Body(box, mass=1.0, x=(0.0, 0.0, 0.0)), "b": dr.Body(box, mass=1.0, x=(1.0, 0.0, 0.0))}
+    world, start = dr.scene(bodies, restitution=0.5, contact=dr.Contact(width=0.02))
+
+    def velocities(row):
+        q = row[3:11].reshape(2, 4)
+        state = dr.replace(
+            start, x=start.x.at[1].set(row[:3]), q=q / jnp.linalg.norm(q, axis=1)[:, None],
+            v=start.v.at[1].set(row[11:14]), w=row[14:].reshape(2, 3),
+        )  # fmt: skip
+        after = dr.step(world, state, 1 / 60)
+        return jnp.concatenate([after.v.ravel(), after.w.ravel()])
+
+    spins = np.tile(np.repeat([0.0, 1.0], [14, 6]), (len(TUMBLING), 1))
+    program = jax.jit(jax.vmap(lambda row, way: jax.jvp(velocities, (row,), (way,))))
+    (_, slopes), (low, _), (high, _) = (program(TUMBLING + step * spins, spins) for step in (0.0, -1e-6, 1e-6))
+    assert_allclose(slopes, (high - low) / 2e-6, atol=1e-7)
+
+
+def test_crossed_rods_strike_by_the_depth_of_their_rounding():
+    """The axes of the predicted paths cross, so that they come as close as minus the sum of the radii."""
+    rod, width = dr.Capsule(radius=0.05, half_length=0.2), 0.02
+    across, down = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)), (0.0, 0.0, -2.0)
+    bodies = {
+        "a": dr.Body(rod, mass=1.0, x=(0.0, 0.0, 0.0)),
+        "b": dr.Body(rod, mass=1.0, x=(0.1, 0.05, 0.12), q=across, v=down),
+    }
+    world, state = dr.scene(bodies, restitution=0.5, contact=dr.Contact(width=width))
+    passing, _ = dr.scene(bodies, ignore=[("a", "b")])
+    for spin in ((0.0, 0.0, 0.0), (0.0, 1.0, 1.0), (0.0, -1.0, 1.0)):
+        turning, dt = dr.replace(state, w=state.w.at[1].set(jnp.array(spin))), 1 / 60
+        after = dr.step(world, turning, dt)
+        (z, v), (z_after, v_after) = ((s.x[1, 2], s.v[1, 2]) for s in (turning, after))
+        at = dr.step(passing, turning, float((z_after - z - v_after * dt) / (v - v_after)))
+        assert_allclose(dr.gap(world, at, "a", "b"), width * np.log1p(np.exp(-0.1 / width)), rtol=1e-6)
+
+
 @pytest.mark.parametrize("speed", [1e-3, 1e-8, 1e-10, 1e-12, 1e-20, 0.0])
 @pytest.mark.parametrize("width", [0.0, 0.01])
 def test_slopes_of_discs_that_hardly_move_are_finite_in_single_precision(speed, width):

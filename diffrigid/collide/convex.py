@@ -8,43 +8,46 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrigid.collide.contacts import Contacts, joined, slack_of
+from diffrigid.collide.contacts import FAR, Contacts, joined, slack_of
 from diffrigid.collide.distance import core_distance
 from diffrigid.collide.edges import crossing_edges
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import replace
-from diffrigid.shapes import Disc, Sphere, edges, radius, vertices
+from diffrigid.shapes import Capsule, Disc, Sphere, edges, radius, vertices
 from diffrigid.state import rotations
 
 
 def convex_convex(a, x_a: Array, q_a: Array, b, x_b: Array, q_b: Array) -> Contacts:
     """Contacts of vertices of a with b, of b with a, and of crossing edges; a disc or sphere only by its own centre."""
     dim = x_a.shape[0]
-    corners_a, corners_b = _placed(a, x_a, q_a), _placed(b, x_b, q_b)
-    slack = _slack(corners_a, radius(a), corners_b, radius(b))
+    corners_a, corners_b = corners_of(a, x_a, q_a), corners_of(b, x_b, q_b)
+    slack = slack_between(corners_a, radius(a), corners_b, radius(b))
     parts = []
     if not isinstance(b, Disc | Sphere):
         parts.append(_corners_against(corners_a, radius(a), b, x_b, q_b, slack))
     if not isinstance(a, Disc | Sphere):
-        parts.append(_flip(_corners_against(corners_b, radius(b), a, x_a, q_a, slack)))
+        of_b = flipped(_corners_against(corners_b, radius(b), a, x_a, q_a, slack))
+        if isinstance(a, Capsule) and isinstance(b, Capsule):  # end on end is one contact, which a's ends have already
+            of_b = replace(of_b, gap=jnp.where(_past_ends(corners_b, a, x_a, q_a), FAR, of_b.gap))
+        parts.append(of_b)
     contacts = joined(*parts)
     if dim == 2 or not edges(a, dim) or not edges(b, dim):
         return contacts
     rounding = radius(a) + radius(b)
     separated = _separates(parts[0], corners_a, rounding, slack)
-    separated = separated | _separates(_flip(parts[1]), corners_b, rounding, slack)
+    separated = separated | _separates(flipped(parts[1]), corners_b, rounding, slack)
     crossings = crossing_edges(a, corners_a, b, corners_b, contacts, separated, slack)
     number = -1.0 - lax.broadcasted_iota(slack.dtype, contacts.gap.shape, 0)
     return joined(replace(contacts, feature=number), crossings)
 
 
-def _placed(shape, x: Array, q: Array) -> Array:
+def corners_of(shape, x: Array, q: Array) -> Array:
     """Corners of the core in the world, (V, D, *batch) [m]."""
     so = rotations(x.shape[0])
     return jax.vmap(lambda corner: x + so.rotate(q, corner))(vertices(shape, x.shape[0]))
 
 
-def _slack(corners_a: Array, round_a: Array, corners_b: Array, round_b: Array) -> Array:
+def slack_between(corners_a: Array, round_a: Array, corners_b: Array, round_b: Array) -> Array:
     """Distance within which two features coincide, by the smaller size, (*batch) [m]."""
 
     def size(corners, rounding):
@@ -68,7 +71,13 @@ def _corners_against(corners: Array, rounding: Array, b, x_b: Array, q_b: Array,
     return jax.vmap(one)(corners)
 
 
-def _flip(c: Contacts) -> Contacts:
+def _past_ends(corners: Array, shape: Capsule, x: Array, q: Array) -> Array:
+    """Whether corners (V, D, *batch) are not beside the axis of a capsule, but past its ends, (V, *batch) bool."""
+    so = rotations(len(x))
+    return jax.vmap(lambda p: jnp.abs(so.unrotate(q, p - x)[0]) >= shape.half_length)(corners)
+
+
+def flipped(c: Contacts) -> Contacts:
     return Contacts(gap=c.gap, normal=-c.normal, point=c.point)
 
 

@@ -61,7 +61,9 @@ def crossing_edges(
         return crossing(pick(edges_a, row // size_b), pick(edges_b, row % size_b), slack)
 
     chosen = jax.vmap(one)(index)
-    exists = (nearest > -FAR) & _along_contact(chosen, contacts, slack)
+    exists = nearest > -FAR
+    if count > 1:  # two capsules have one normal where they cross, and ends that touch do not change it
+        exists = exists & _along_contact(chosen, contacts, slack)
     gap = jnp.where(exists, chosen.distance - (radius(a) + radius(b))[None], FAR)
     shift = (radius(b) - radius(a))[None, None] * chosen.normal  # from between the cores to between the surfaces
     middle = 0.5 * (chosen.on_a + chosen.on_b + shift)
@@ -82,6 +84,7 @@ class Crossing(NamedTuple):
     normal: Array  # (3, *batch)
     on_a: Array  # (3, *batch) [m]
     on_b: Array
+    cross: Array  # (*batch) bool: they are not parallel
     within: Array  # (*batch) bool: both points are inside their edges
     lowest: Array  # (*batch) [m] how far a face beside an edge dips towards the other shape, negative
 
@@ -108,7 +111,7 @@ def crossing(a: Edges, b: Edges, slack: Array) -> Crossing:
     sign = jnp.where(towards >= 0, 1.0, -1.0).astype(n.dtype)
     lowest = jnp.minimum(jnp.minimum(sign * sides[0], sign * sides[1]), jnp.minimum(sign * sides[2], sign * sides[3]))
     n = sign[None] * n
-    return Crossing(dot(n, on_a - on_b), n, on_a, on_b, within, lowest)
+    return Crossing(dot(n, on_a - on_b), n, on_a, on_b, cross, within, lowest)
 
 
 def are_outermost(c: Crossing, deepest: Array, slack: Array) -> Array:

@@ -14,7 +14,9 @@ from jax import Array, lax
 from diffrigid.branches import choose
 from diffrigid.contact.approach import Task, spinning_up
 from diffrigid.contact.gaps import Gaps, least_of
+from diffrigid.contact.sides import Side, gap_rates, have_depth, place, separation_of
 from diffrigid.numerics import safe_divide, safe_sqrt, softplus
+from diffrigid.shapes import radius
 
 LOOKS = 48  # evaluations of the gaps, at most
 FIRST = 0.25  # [-] of the step: the first step forward
@@ -79,10 +81,17 @@ def level_at(closing: Look, opening: Look, width: Array) -> Array:
     return softplus(share * closing.gap + (1.0 - share) * opening.gap + share * low * span, width)
 
 
-def look_at(t: Array, gaps: Gaps) -> Look:
-    """The least of the gaps at t (*batch) [s]."""
+def look_at(a: Side, b: Side, t: Array, gaps: Gaps) -> Look:
+    """The least of the gaps at t (*batch) [s]; where the two overlap minus their depth, which has no jumps."""
     chosen = lax.stop_gradient(least_of(gaps.gap))
-    return Look(t, (chosen * gaps.gap).sum(0), (chosen * gaps.rate).sum(0))
+    gap, rate = (chosen * gaps.gap).sum(0), (chosen * gaps.rate).sum(0)
+    if not have_depth(a, b):
+        return Look(t, gap, rate)
+    at_a, at_b = place(a, t), place(b, t)
+    cores = separation_of(a, at_a, b, at_b)
+    inside = (cores.gap < 0)[0]
+    depth, sinking = cores.gap[0] - radius(a.shape) - radius(b.shape), gap_rates(cores, at_a, at_b)[0]
+    return Look(t, jnp.where(inside, depth, gap), jnp.where(inside, sinking, rate))
 
 
 def from_time(t: Array) -> Nearing:
@@ -95,7 +104,7 @@ def from_time(t: Array) -> Nearing:
 def nearer(task: Task, now: Nearing, gaps: Gaps) -> Nearing:
     """State of the search after the look at `now.t`."""
     assert task.width is not None
-    here, first = look_at(now.t, gaps), now.looks == 0
+    here, first = look_at(task.a, task.b, now.t, gaps), now.looks == 0
     closes, within = here.rate < 0, task.slack * task.span
     closing, opening = choose(closes, here, now.closing), choose(closes, now.opening, here)
     between = (closing.t > -jnp.inf) & (opening.t < jnp.inf)

@@ -80,7 +80,7 @@ def _differentiable_jvp(primals, tangents):
     level, width, a, b, closest = primals
 
     def at_closest(width: Array, a: Side, b: Side) -> Array:
-        looks = jax.vmap(lambda t: look_at(t, gaps_at(a, b, t)))(jnp.stack([closest.before, closest.after]))
+        looks = jax.vmap(lambda t: look_at(a, b, t, gaps_at(a, b, t)))(jnp.stack([closest.before, closest.after]))
         before, after = (jax.tree.map(operator.itemgetter(k), looks) for k in range(2))
         return jnp.where(closest.exists, level_at(before, after, width), 0.0)
 

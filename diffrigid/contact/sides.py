@@ -11,12 +11,13 @@ from diffrigid.collide import COLLIDERS, Contacts, PairGroup
 from diffrigid.collide.contacts import FAR
 from diffrigid.collide.distance import reach
 from diffrigid.collide.heights import candidates
+from diffrigid.collide.penetration import core_separation
 from diffrigid.fence import unfused
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import rows
 from diffrigid.numerics import dot, norm
 from diffrigid.pytree import array, pytree, replace
-from diffrigid.shapes import BOUNDLESS, Capsule, Disc, HalfSpace, HeightField, Sphere, radius
+from diffrigid.shapes import BOUNDLESS, Capsule, Disc, HalfSpace, HeightField, Sphere, faces, radius
 from diffrigid.state import at_place, rotations
 
 if TYPE_CHECKING:
@@ -149,6 +150,17 @@ def candidates_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
     if isinstance(b.shape, HeightField):
         return candidates(a.shape, *_origin(a, at_a), b.shape, *_origin(b, at_b))
     return contacts_of(a, at_a, b, at_b)
+
+
+def have_depth(a: Side, b: Side) -> bool:
+    """Whether two shapes are convex and bounded, and one of their cores has faces. Static."""
+    dim = (a if b.flight is None else b).flight.dim
+    return not isinstance(b.shape, BOUNDLESS) and bool(faces(a.shape, dim) or faces(b.shape, dim))
+
+
+def separation_of(a: Side, at_a: Placed, b: Side, at_b: Placed) -> Contacts:
+    """The contact along the direction of the largest separation of two cores that `have_depth`, (1, ...)."""
+    return core_separation(a.shape, *_origin(a, at_a), b.shape, *_origin(b, at_b))
 
 
 def _origin(side: Side, at: Placed) -> tuple[Array, Array]:
