@@ -300,6 +300,49 @@ def test_law_is_the_same_in_any_unit(dim, mass, speed):
             assert_allclose(np.asarray(other, np.float64) / unit, one, rtol=1e-5, atol=1e-5 * np.abs(one).max())
 
 
+def test_friction_in_space_acts_against_the_slip_that_it_leaves():
+    """Where a corner couples the directions: Newton's and Coulomb's law, no gain of energy, and slopes."""
+    rng, count = np.random.default_rng(0), 400
+    factor = rng.normal(size=(3, 3, count))
+    K = np.einsum("ijc,kjc->ikc", factor, factor) + 0.1 * np.eye(3)[..., None]
+    n, v = (r / np.linalg.norm(r, axis=0) for r in rng.normal(size=(2, 3, count)))
+    v = np.where((n * v).sum(0) > 0, -v, v)
+    e, mu = rng.uniform(0.0, 1.0, (2, count))
+    given = K, n, v, -e * (n * v).sum(0), mu
+    way = tuple(rng.normal(size=np.shape(value)) for value in given)
+
+    jitted = jax.jit(contact_law)
+
+    def law(step):
+        return jitted(*(jnp.asarray(value) + step * by for value, by in zip(given, way, strict=True)))
+
+    P, slope = jax.jvp(law, (0.0,), (1.0,))
+    assert_allclose(slope, (law(1e-7) - law(-1e-7)) / 2e-7, atol=1e-5 * np.abs(slope).max())
+    P = np.asarray(P)
+    P_n, after = (n * P).sum(0), v + np.einsum("ijc,jc->ic", K, P)
+    v_n, P_t = (n * after).sum(0), P - P_n * n
+    slip, size = after - v_n * n, np.linalg.norm(P_t, axis=0)
+    assert_allclose(v_n, -e * (n * v).sum(0), atol=EXACT)
+    assert (size <= mu * P_n + EXACT).all()
+    sticks = np.linalg.norm(slip, axis=0) < EXACT
+    slides = ~sticks & (size > mu * P_n - EXACT)  # the others are bounded by their energy
+    assert sticks.sum() > 30
+    assert slides.sum() > 200
+    assert_allclose((P_t * slip).sum(0)[slides], -(size * np.linalg.norm(slip, axis=0))[slides], atol=EXACT)
+    assert (((v + after) * P).sum(0) < EXACT).all()  # twice the energy that it adds
+
+
+def test_sticking_turns_to_slipping_without_a_jump():
+    """In space, where the impulse that would stop the slip has another direction than the slip."""
+    K = np.array([[3.0, 1.4, -0.7], [1.4, 2.0, 0.9], [-0.7, 0.9, 1.5]])
+    mu = np.linspace(0.0, 2.0, 8001)
+    n, v = np.array([0.0, 0.0, 1.0]), np.array([0.5, -0.4, -1.0])
+    P = jax.jit(jax.vmap(lambda mu: contact_law(*map(jnp.asarray, (K, n, v, 0.5)), mu)))(mu)
+    assert_allclose(P[0, :2], 0.0)
+    assert np.abs(np.diff(P, axis=0)).max() < 2e-3 * np.abs(P).max()
+    assert_allclose(P[-1], P[-500])  # it sticks at last
+
+
 def test_a_contact_that_is_off_has_no_derivative():
     """In a list of contacts most are far apart, where the law overflows in float32: 0, and not 0 * inf."""
     far = {"K": jnp.diag(jnp.array([2.0, 9.0]))[None], "n": jnp.array([[0.6, 0.8]]), "v": jnp.full((1, 2), -1e25)}

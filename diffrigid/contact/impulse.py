@@ -6,15 +6,17 @@ the contact point,
     n . v+ = target,  the normal law:    target = -e n . v-  (Newton)
     P = gamma n + kappa Q,               gamma = (target - n . v-) / (n . K n),  1 / (n . K n): effective mass
     sticks:  K Q = -(slip after gamma n)                            if then |P_t| <= mu P_n
-    slides:  P = gamma_s (n - mu slip / |slip|) = gamma n + Q       else; gamma_s such that the normal law holds
+    slides:  P_t = -mu P_n slip+ / |slip+|                          else; slip+: what P leaves of the slip
     kinetic energy does not rise         a bound kappa <= 1 that acts rarely (Kane's paradox)
 
-For a round body this is the textbook law: |gamma_t| <= mu gamma, stick if the impulse that stops the slip
-fits, else slide against it. Where a corner couples the directions, Newton's law still holds exactly.
+For a round body, and in the plane, this is the textbook law: |gamma_t| <= mu gamma, stick if the impulse that stops the
+slip fits, else slide against it. Where a corner couples the directions Newton's law still holds exactly, and friction
+turns the slip. It acts against the slip that is left, as where contacts are solved together: so impulses are continuous
+from slipping to sticking.
 Source: Chatterjee & Ruina, J. Applied Mechanics 65 (1998) 939, for the splitting; Kane & Levinson 1985.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +25,13 @@ from jax import Array, lax
 from diffrigid.contact.levers import Levers
 from diffrigid.contact.sides import Placed
 from diffrigid.linear import matvec
-from diffrigid.numerics import dot, safe_divide, safe_sqrt
+from diffrigid.numerics import dot, implicit_root, norm, safe_divide, safe_sqrt
 from diffrigid.so2 import perp
 from diffrigid.so3 import tangents
 from diffrigid.state import rotations
 
-JAMMED = 1e-3  # [-] of the normal mobility: sliding would close the contact as fast as its normal impulse opens it
+ROUNDS = 10  # of Newton's method for the direction in which friction acts in space
+NEAR = 1e-3  # [-] by which a step may leave the bracket of the root: rounding does, at the root
 
 
 def restitution_at(u: Array, restitution: Array, falloff: Array | None = None) -> Array:
@@ -119,15 +122,85 @@ def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array) -> list:
         slip: tangential velocity after gamma n [m/s].
     """
     stop = _stopping_impulse(k, slip)
-    # sliding: P = gamma_s (n - mu along), with gamma_s such that the normal law holds
-    speed = safe_sqrt(sum(s * s for s in slip))
-    along = [safe_divide(s, speed) for s in slip]
-    share = 1.0 - mu * sum(k_nt * e for k_nt, e in zip(k[0][1:], along, strict=True))
-    bound = mu * (gamma + stop[0])
-    sticks = (safe_sqrt(sum(P * P for P in stop[1:])) <= bound) | (share < JAMMED)
-    slides = gamma / jnp.where(sticks, 1.0, share)
-    slide = [slides - gamma, *(-mu * slides * e for e in along)]
+    sticks = safe_sqrt(sum(P * P for P in stop[1:])) <= mu * (gamma + stop[0])
+    # Where it sticks no slip is left, and it has no direction: another one slides there, without friction.
+    slip, gamma = [jnp.where(sticks, 1.0, s) for s in slip], jnp.where(sticks, 0.0, gamma)
+    slide = (_slide_in_plane if len(k) == 2 else _slide_in_space)(k, gamma, slip, mu)
     return [jnp.where(sticks, P, Q) for P, Q in zip(stop, slide, strict=True)]
+
+
+def _slide_in_plane(k: list, gamma: Array, slip: list, mu: Array) -> list:
+    """Friction impulse against a slip in the plane, which keeps its direction."""
+    k_nt, bound = k[0][1], jnp.where(slip[0] < 0, mu, -mu)
+    P_t = bound * safe_divide(gamma, 1.0 + bound * k_nt)
+    return [-k_nt * P_t, P_t]
+
+
+def _slide_in_space(k: list, gamma: Array, slip: list, mu: Array) -> list:
+    """Friction impulse against what it leaves of a slip s in space.
+
+    With A the mobility along the contact if the normal velocity is kept, P_t = -rho (I + rho A)^-1 s: with rho = 0
+    there is no friction, and it sticks as rho grows. The unknown is x = 1 / (1 + rho a), a = tr(A) / 2, for which
+    |P_t| = mu P_n; this equation is linear for a round body.
+    """
+    (_, *k_n), *rows = k
+    A = jnp.stack([jnp.stack([row[j + 1] - row[0] * k_n[j] for j in range(2)]) for row in rows])
+    a = 0.5 * (A[0, 0] + A[1, 1])
+    A = safe_divide(A, a[None, None])
+    s = jnp.stack(slip)
+    stopped = jnp.stack([A[1, 1] * s[0] - A[0, 1] * s[1], A[0, 0] * s[1] - A[1, 0] * s[0]])  # adj(A) s
+    sliding = Sliding(s, stopped, A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0], jnp.stack(k_n), a * gamma, mu)
+    x = lax.stop_gradient(sliding).root()
+    x = implicit_root(x, sliding.excess(x), sliding.slope(x))
+    P = -safe_divide(1.0 - x, a * sliding.det_at(x))[None] * sliding.left(x)
+    return [-dot(sliding.k_n, P), *P]
+
+
+class Sliding(NamedTuple):
+    """The equation for x of `_slide_in_space`, times a det_at(x)."""
+
+    slip: Array  # (2, *batch) [m/s]
+    stopped: Array  # (2, *batch) [m/s] adj(A / a) slip
+    det: Array  # (*batch) [-] of A / a
+    k_n: Array  # (2, *batch) [-] of the normal velocity by P_t
+    gamma: Array  # (*batch) a gamma
+    mu: Array
+
+    def left(self, x: Array) -> Array:
+        """The slip that is left, times det_at(x), (2, *batch)."""
+        return self.stopped + x[None] * (self.slip - self.stopped)
+
+    def det_at(self, x: Array) -> Array:
+        """Determinant of x I + (1 - x) A / a."""
+        return 1.0 - (1.0 - x) ** 2 * (1.0 - self.det)
+
+    def excess(self, x: Array) -> Array:
+        """Of |P_t| over mu P_n: negative at x = 1, positive at x = 0."""
+        left = self.left(x)
+        return (1.0 - x) * (norm(left) - self.mu * dot(self.k_n, left)) - self.mu * self.gamma * self.det_at(x)
+
+    def slope(self, x: Array) -> Array:
+        """Derivative of `excess` by x."""
+        left, turning = self.left(x), self.slip - self.stopped
+        growing = safe_divide(dot(left, turning), norm(left)) - self.mu * dot(self.k_n, turning)
+        falling = norm(left) - self.mu * dot(self.k_n, left)
+        return (1.0 - x) * (growing - 2.0 * self.mu * self.gamma * (1.0 - self.det)) - falling
+
+    def root(self) -> Array:
+        """x of the sliding contact, (*batch), by Newton's method within a bracket that is halved where it fails."""
+
+        def improved(_, now: tuple) -> tuple:
+            low, high, x = now
+            excess = self.excess(x)
+            low, high = jnp.where(excess > 0, x, low), jnp.where(excess > 0, high, x)
+            slope = self.slope(x)
+            following = x - safe_divide(excess, slope)
+            far = (slope >= 0) | (following < low - NEAR) | (following > high + NEAR)
+            return low, high, jnp.where(far, 0.5 * (low + high), jnp.clip(following, low, high))
+
+        zero = jnp.zeros_like(self.mu)
+        first = 1.0 - safe_divide(self.mu * self.gamma, norm(self.slip))  # exact for a round body
+        return lax.fori_loop(0, ROUNDS, improved, (zero, zero + 1.0, jnp.clip(first, 0.0, 1.0)))[2]
 
 
 def _stopping_impulse(k: list, slip: list) -> list:
