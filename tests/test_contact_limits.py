@@ -475,6 +475,24 @@ def test_a_plate_that_lands_on_a_box_almost_flat_does_not_sink_in():
         assert dr.gap(world, end, "plate", "box") > -1e-6  # 4.2 mm, and 52 um growing to 15 mm
 
 
+def test_boxes_that_their_spins_bring_together_do_not_sink_in():
+    """They bounce ever more often within a step, more often than it has sweeps, and roll on from there."""
+    bodies = {
+        "a": dr.Body(
+            dr.Box(half=(0.1823, 0.0775)), density=10.0, x=(0.0, 0.0), angle=-1.872, v=(1.0525, -1.698), w=0.1723
+        ),
+        "b": dr.Body(
+            dr.Box(half=(0.1208, 0.1719)), density=10.0, x=(0.3767, -0.5757), angle=1.3147, v=(-1.2215, 1.663), w=2.6417
+        ),
+    }
+    world, state = dr.scene(bodies, restitution=0.484)
+    states = dr.rollout(world, state, dt=1 / 60, steps=20).state
+    gaps = jax.jit(jax.vmap(lambda state: dr.gap(world, state, "a", "b")))(states)
+    assert gaps.min() > -1e-8
+    energy = jax.vmap(lambda state: dr.kinetic_energy(world.bodies, state).sum())(states)
+    assert (np.diff(energy) < 1e-12 * energy[0]).all()
+
+
 @pytest.mark.slow
 def test_an_edge_of_a_plate_that_tips_over_a_box_strikes_at_its_time():
     """Of two crossings of edges that touch by turns the one that strikes comes nearer than the one that rested."""

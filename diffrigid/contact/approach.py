@@ -76,7 +76,7 @@ def resting(task: Task, gaps: Gaps) -> Array:
     slow enough to come to rest anyway. Else, in a free flight without support, they would be found to close first, and
     hide the fast impact of another corner.
     """
-    gap, v, acc, *_ = gaps
+    gap, v, acc = gaps.gap, gaps.rate, gaps.pull
     near, slow = (NEAR * task.size)[None], task.slow[None]
     touching = touches(gap, v, acc, near, slow)
     # A contact that closes at a third of the speed of its fall would be back within the step, whatever e <= 1.
@@ -89,7 +89,7 @@ def taking_over(task: Task, gaps: Gaps, rests: Array) -> Array:
     if gaps.held is None:
         return rests
     (gap, v), near, slow = gaps.held, (NEAR * task.size)[None], task.slow[None]
-    return rests | (touches(gap, v, gaps.acceleration, near, slow) & is_supported(task.a, task.b)[None])
+    return rests | (touches(gap, v, gaps.pull, near, slow) & is_supported(task.a, task.b)[None])
 
 
 def falling(task: Task, gaps: Gaps, rests: Array, s: Array) -> Array:
@@ -98,7 +98,7 @@ def falling(task: Task, gaps: Gaps, rests: Array, s: Array) -> Array:
     Crossings of edges are listed by their gaps: of those that touch, one that strikes may take the place of one that
     rested. What has fallen as fast as that is as deep inside.
     """
-    least = task.slow[None] + 2.0 * jnp.abs(gaps.acceleration) * jnp.maximum(task.span, 0.0)[None]
+    least = task.slow[None] + 2.0 * jnp.abs(gaps.pull) * jnp.maximum(task.span, 0.0)[None]
     deep = gaps.gap <= FALLEN * gaps.rate * jnp.maximum(s - task.start, 0.0)[None]
     return rests & ((gaps.rate >= -least) | deep)
 
@@ -122,7 +122,7 @@ def clearance(task: Task) -> Callable[[Gaps, Array, Array], Array]:
         return jnp.where(s < t1, unseen_for(b.shape, b.q, height, v, spinning), jnp.inf)
 
     def clear(gaps: Gaps, rests: Array, s: Array) -> Array:
-        gap, v, acc, normal, *_ = gaps
+        gap, v, acc, normal = gaps.gap, gaps.rate, gaps.acceleration, gaps.normal
         if normal is None:
             apart = _time_to(gap, v, acc - jerk[None] * jnp.maximum(t1 - s, 0.0)[None] / 3.0)
         else:

@@ -6,6 +6,7 @@ momentum. The velocity that the impulse must cancel is that at the end, along th
 of the end for both, tipping, or sliding over a round body, would be of first order only.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -66,8 +67,10 @@ def levers(
     return Levers(arm_a=ends[0], arm_b=ends[1], mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate)
 
 
-def with_rates(a: Side, at_a: Placed, b: Side, at_b: Placed) -> tuple[Contacts, Contacts]:
-    """Contacts of a pair, and their time derivatives at the bodies' velocities."""
+def with_rates(
+    a: Side, at_a: Placed, b: Side, at_b: Placed, of: Callable[..., Contacts] = contacts_of
+) -> tuple[Contacts, Contacts]:
+    """Contacts `of` a pair, and their time derivatives at the bodies' velocities."""
     so = rotations(at_a.x.shape[0])
     poses = [(at.x, at.q) for at in (at_a, at_b)]
     rates = [
@@ -78,7 +81,7 @@ def with_rates(a: Side, at_a: Placed, b: Side, at_b: Placed) -> tuple[Contacts, 
     def moved(a: Side, b: Side, poses: list, rates: list) -> tuple[Contacts, Contacts]:
         def placed(*poses: tuple) -> Contacts:
             at_a, at_b = (Placed(x=x, q=q) for x, q in poses)
-            return contacts_of(a, at_a, b, at_b)
+            return of(a, at_a, b, at_b)
 
         return jax.jvp(placed, tuple(poses), tuple(rates))
 

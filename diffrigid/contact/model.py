@@ -225,8 +225,12 @@ def _demanded(
     restitution, friction = (coefficients(world, name, dt.shape) for name in ("restitution", "friction"))
     if world.bodies.restitution_falloff is not None:
         restitution = restitution_at(u, restitution, coefficients(world, "restitution_falloff", dt.shape))
-    # Bodies that only a spin brings together again bounce: rest would cost them energy.
+    # Bodies that only a spin brings together again bounce: rest would cost them energy. But speeds and times shrink by
+    # the restitution with each bounce, and what has lost all speed by the end of the step may lose it at once.
     presses = jnp.minimum(closing_acc, strikes.press)
+    bounced_out = jnp.maximum(presses, (1.0 - restitution) * closing_acc)
+    width = world.contact.width
+    presses = bounced_out if width is None else jnp.where((width > 0)[None], presses, bounced_out)
     stays = comes_to_rest(u, restitution * u, presses, dt[None] - strikes.s, world.contact.rest_speed[None])
     held, resting = _held(world, strikes, resting, stays, u <= _fallen(world, flight, strikes, closing_acc, dt), phase)
     began = jnp.maximum(*(at_colliders(anchors.t0, side, -jnp.inf) for side in (strikes.a, strikes.b)))

@@ -207,6 +207,8 @@ def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
     clear = clearance(task)
 
     def follow(now: Search, gaps: Gaps) -> Search:
+        if task.width is not None:  # inside the level of a smooth impact contacts part, and turn round there
+            gaps = gaps._replace(acceleration=jnp.where(task.width > 0, gaps.pull, gaps.acceleration))
         before = transferred(now.rests, now.feature, gaps.feature)
         rests = taking_over(task, gaps, jnp.where(now.count == 0, resting(task, gaps), before))
         now = now._replace(count=now.count + 1, rests=rests, feature=gaps.feature)
