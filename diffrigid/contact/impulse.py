@@ -163,8 +163,8 @@ class Sliding(NamedTuple):
     stopped: Array  # (2, *batch) [m/s] adj(A / a) slip
     det: Array  # (*batch) [-] of A / a
     k_n: Array  # (2, *batch) [-] of the normal velocity by P_t
-    gamma: Array  # (*batch) a gamma
-    mu: Array
+    gamma: Array  # (*batch) [m/s] a gamma
+    mu: Array  # (*batch) [-]
 
     def left(self, x: Array) -> Array:
         """The slip that is left, times det_at(x), (2, *batch)."""

@@ -67,7 +67,7 @@ class Contact:
             traced number: anneal it to zero without recompiling.
         rest_speed: (*batch) [m/s] slower impacts do not rebound (at the limits of a hinge: this number in rad/s). Nor
             do faster ones after which the bodies would meet again before the step ends: they come to rest on each
-            other.
+            other. Bodies that only their spins bring together do so if all their bounces end within the step.
         sweeps: largest number of successive impacts of a body within a step. Later ones are found, and repaired, in
             the next step. A step that does not need its sweeps skips them; in a gradient each costs memory traffic.
         neighbours: capacity of the neighbour list of a body, in a crowd of 256 bodies or more: see `missed_pairs`.

@@ -207,7 +207,7 @@ def _follower(task: Task) -> Callable[[Search, Gaps], Search]:
     clear = clearance(task)
 
     def follow(now: Search, gaps: Gaps) -> Search:
-        if task.width is not None:  # inside the level of a smooth impact contacts part, and turn round there
+        if task.width is not None:  # what turns round inside the level of a smooth impact is to wait
             gaps = gaps._replace(acceleration=jnp.where(task.width > 0, gaps.pull, gaps.acceleration))
         before = transferred(now.rests, now.feature, gaps.feature)
         rests = taking_over(task, gaps, jnp.where(now.count == 0, resting(task, gaps), before))
