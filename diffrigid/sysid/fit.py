@@ -124,8 +124,8 @@ def fit(
 def _stages(widths: Sequence[float], windows: Sequence[float]) -> list[tuple[float, float]]:
     """(width, window) of the successive fits."""
     wide, long = _lengths("widths", widths, "[m], the last one usually 0"), _lengths("windows", windows, "[s]")
-    if not (long > 0).all():
-        raise ValueError(f"windows is {windows!r}, expected times > 0 [s], the last one usually inf")
+    if not (long > 0).all() or (np.diff(long) <= 0).any():
+        raise ValueError(f"windows is {windows!r}, expected increasing times > 0 [s], the last one usually inf")
     return [(width, long[0]) for width in wide] + [(wide[-1], window) for window in long[1:]]
 
 

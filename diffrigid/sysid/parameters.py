@@ -177,8 +177,14 @@ def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unli
     slot = Slot(" = ".join(names), names, kind, 0, prior)
     if slot.is_vector:
         slot = replace(slot, name=" : ".join(names))
+    shapes = {read(having[0], name).shape for name in names}
+    if len(shapes) > 1 or (slot.is_vector and shapes != {()}):
+        expected = "numbers" if slot.is_vector else "one shape"
+        raise ValueError(f"free[{key!r}]: paths of shapes {sorted(shapes)}, expected {expected}")
     shape = reference(slot, having[0]).shape
     size = kind.size(shape)
+    if isinstance(kind, Chart) and kind.name == "rotation" and not names[0].endswith((".q", ".zero")):
+        raise ValueError(f"free[{key!r}]: rotation() is for orientations, such as 'die.q'")
     if isinstance(kind, Free) and component(names[0])[0].endswith(".inertia") and having[0].world.dim == 3:
         raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
     for scene in having:
