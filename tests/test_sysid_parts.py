@@ -293,9 +293,13 @@ def test_degrees_in_a_column_of_angles_are_noticed_and_so_is_data_without_noise(
         *dr.scene({"wheel": wheel}), {"t": t, "wheel.angle": np.degrees(2.0 * t)}, free={"wheel.w": dr.real()}
     )
     assert found.notes[0].startswith("the fit failed") and "degrees" in found.notes[0]
-    exact = dr.fit(*dr.scene({"wheel": wheel}), {"t": t, "wheel.angle": 2.0 * t}, free={"wheel.w": dr.real()})
+    measured, free = {"t": t, "wheel.angle": 2.0 * t}, {"wheel.w": dr.real()}
+    exact = dr.fit(*dr.scene({"wheel": wheel}), measured, free=free)
     (note,) = exact.notes  # rounding is neither white nor normal, which says nothing of the model
     assert note.startswith("residuals of wheel.angle are rounding")
+    given = dr.fit(*dr.scene({"wheel": wheel}), measured, free=free, noise={"wheel.angle": 1e-3})
+    (note,) = given.notes  # nor does it make intervals too narrow
+    assert note.startswith("residuals are") and note.endswith("times the noise that was given for wheel.angle")
 
 
 def test_times_in_milliseconds_are_doubted_before_the_fit():

@@ -26,7 +26,7 @@ from diffrigid.sysid.diagnosis import (
 )
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.losses import Loss, Squares
-from diffrigid.sysid.noise import least_noise
+from diffrigid.sysid.noise import exact_columns
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
 from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
@@ -34,6 +34,7 @@ from diffrigid.sysid.table import BLIND, BOUND
 from diffrigid.world import World
 
 UNSEEN = 1e-6  # [-] part of a slope along undetermined directions: more is not rounding
+FAINT = 0.1  # [-] of a deviation: residuals that are all smaller do not make intervals too narrow, white or not
 CLOSE = 0.95  # [-] correlation from which on two parameters are reported to go together
 
 
@@ -85,12 +86,11 @@ def _notes(
             "high) if values beyond it are possible; if not, dr.profile gives an interval that ends there"
         )
     notes += _together(uncertainty.covariance, places, blind)
-    exact = [name for name, sigma in problem.noise.items() if sigma <= least_noise(problem, name)]
-    if exact:
+    if exact := exact_columns(problem):
         names = ", ".join(exact)
         notes.append(f"residuals of {names} are rounding, as for simulated data without noise: intervals mean nothing")
     tested = [column for record in residuals for name, column in record.items() if name not in exact]
-    series = [r for column in tested for r in column.T if np.isfinite(r).any()]
+    series = [r for column in tested for r in column.T if np.nanmax(np.abs(r), initial=0.0) > FAINT]
     lost = linear.shared + sum(s.shape[1] - linear.shared for s in linear.slopes)
     count = sum(map(len, linear.rows))
     given: dict[str, list[np.ndarray]] = {}

@@ -40,6 +40,11 @@ def least_noise(problem: Problem, name: str) -> float:
     return max(LEAST_NOISE, 8 * float(np.finfo(problem.dtype).eps)) * (size or 1.0)
 
 
+def exact_columns(problem: Problem) -> list[str]:
+    """Columns whose estimated noise is rounding, as that of simulated data."""
+    return [name for name, sigma in problem.noise.items() if sigma <= least_noise(problem, name)]
+
+
 def _lost(problem: Problem, linear: Linear) -> dict[str, float]:
     """Number of parameters that the residuals of each column determine: the sum of their leverages."""
     lost = dict.fromkeys(problem.noise, 0.0)

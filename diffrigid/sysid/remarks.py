@@ -20,6 +20,7 @@ from diffrigid.sysid.diagnosis import LARGE, RARE, whiteness
 from diffrigid.sysid.first_rows import is_begun
 from diffrigid.sysid.levenberg import Numbers, Point, cost_of, point_at
 from diffrigid.sysid.losses import Squares
+from diffrigid.sysid.noise import exact_columns
 from diffrigid.sysid.parameters import Scene, pieces
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.problem import full_turn
@@ -95,6 +96,8 @@ def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, los
             "the slopes of the residuals are enormous: the motion is unstable, or chaotic; make dt smaller, or begin "
             "with a short part, windows=(0.5, 1, inf)"
         ]
+    if len(exact_columns(problem)) == len(noise):  # rounding jumps everywhere
+        return []
     shared = -_ratio(g[:, :a].sum(0), h[:, :a].sum(0))
     own = -_ratio(g[:, a:], h[:, a:])
     falls = -(g[:, :a].sum(0) @ shared + (g[:, a:] * own).sum())
