@@ -115,6 +115,31 @@ def test_a_start_on_a_bound_is_pulled_off_it():
         dr.interval(1, 0)
 
 
+@pytest.mark.parametrize("guess", [(0.41, 0.61, (0.0, 0.0)), (0.63, 0.76, (-0.4, 0.6)), (0.5, 0.9, (2.0, -1.5))])
+def test_windows_lead_in_from_a_start_that_strikes_nothing(guess):
+    """At rest, on the way back, or past the second disc: the whole record alone is not fitted from there."""
+    free = {"restitution": dr.interval(0, 1), "d1.mass": dr.positive(), "d0.v": dr.real()}
+    with pytest.raises(ValueError, match="the fit failed"):
+        dr.fit(*discs(*guess), record(1), free=free, windows=(np.inf,), progress=False)
+    found = dr.fit(*discs(*guess), record(1), free=free, progress=False)
+    assert found["restitution"].low < 0.8 < found["restitution"].high
+    assert found["d1.mass"].low < 2.0 < found["d1.mass"].high
+
+
+def test_a_restitution_that_was_not_given_begins_off_its_bound():
+    """From 0 the ball would come to rest at its first impact, and no restitution would be seen."""
+    ball, floor = dr.Body(dr.Disc(radius=0.05), mass=0.2, x=(0.0, 1.2)), dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+    t = np.arange(0.0, 1.1, 1 / 60)
+    hit = np.sqrt(2 * 1.15 / 9.81)
+    height = np.where(t < hit, 1.2 - 4.905 * t**2, 0.05 + 0.75 * 9.81 * hit * (t - hit) - 4.905 * (t - hit) ** 2)
+    measured = {"t": t, "ball.x": np.stack([0.0 * t, height], 1)}
+    found = dr.fit(
+        *dr.scene({"ball": ball, "floor": floor}, gravity=(0.0, -9.81)), measured,
+        free={"restitution": dr.interval(0, 1)}, noise={"ball.x": 1e-3}, progress=False,
+    )  # fmt: skip
+    assert_allclose(found["restitution"].value, 0.75, atol=1e-4)
+
+
 def test_starts_are_grouped_by_the_order_of_their_impacts(fit, tmp_path):
     """In truth the first strikes the second, and that the third."""
     assert all(order == (("d0-d1", "d1-d2"),) for order in fit.orders[: fit.agree])

@@ -72,6 +72,8 @@ def blind_directions(linear: Linear, coordinates: Sequence[Coordinate]) -> list[
             names = [c.name for c, off in zip(coordinates, unseen & mine, strict=True) if off]
             label = path if unseen[mine].all() else ", ".join(names)
             words = f"nothing that was measured depends on {label}"
+            if path.endswith("friction"):
+                words += ": at the best fit nothing slips, so that any larger value fits as well"
             out.append(Blind((unseen & mine).astype(float), (path,), words))
     seen = np.flatnonzero(~unseen)
     scaled = J[:, seen] / sizes[seen]
@@ -204,7 +206,7 @@ def doubts(series: Sequence[np.ndarray], robust: bool = False) -> list[str]:
     if (p := whiteness(series)) < RARE:
         out.append(
             f"residuals are autocorrelated (p = {p:.1g}), so intervals are too narrow: the model misses something, or "
-            "the fit is in a local minimum (compare starts=16, or windows=)"
+            "the fit is in a local minimum (compare starts=16)"
         )
     joined = np.concatenate([np.zeros(0), *(r[np.isfinite(r)] for r in series)])
     if not robust and (p := normality(joined)) < RARE:

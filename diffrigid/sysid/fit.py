@@ -14,7 +14,8 @@ from diffrigid.sysid.columns import check_mapping
 from diffrigid.sysid.covariance import Intervals, Linear, check_intervals, from_jacobian
 from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.intervals import describe
-from diffrigid.sysid.levenberg import INTERRUPTED, Point, Report, cost_of, levenberg
+from diffrigid.sysid.lead_in import better, growing, is_suspect
+from diffrigid.sysid.levenberg import INTERRUPTED, Numbers, Point, Report, cost_of, levenberg, point_at
 from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.noise import all_noise, estimated_noise, rescaled
 from diffrigid.sysid.orders import impact_orders
@@ -42,7 +43,7 @@ def fit(
     noise: Mapping[str, Any] | None = None,
     observe: Mapping[str, Any] | None = None,
     widths: Sequence[float] | None = None,
-    windows: Sequence[float] = (np.inf,),
+    windows: Sequence[float] | None = None,
     loss: Loss = SQUARES,
     solver: Callable | None = None,
     intervals: Intervals = from_jacobian,
@@ -71,6 +72,8 @@ def fit(
         widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets starts that
             miss an impact find it. Default: the width of the world, 0 unless set.
         windows: [s] of each record from its start, one fit after the other: (0.5, 1, 2, inf) leads into a long one.
+            Default: (inf,), and eighths of the longest record after it, if residuals are left that are not noise; each
+            start then keeps the better result. (inf,) alone leaves that out.
         loss: `diffrigid.sysid.squares()`, `dr.huber()` or `dr.student()`.
         solver: default Levenberg-Marquardt; for many numbers `diffrigid.sysid.first_order(optax.adam(1e-2))` or
             `diffrigid.sysid.lbfgs()`.
@@ -101,22 +104,31 @@ def fit(
     _check_parts(loss, solver, intervals, seed, resume)
     check_mapping("observe", observe)
     problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
-    stages = _stages((problem.width,) if widths is None else widths, windows)
+    stages = _stages((problem.width,) if widths is None else widths, (np.inf,) if windows is None else windows)
     if world.crowd and any(width > 0 for width, _ in stages):
         raise ValueError(f"widths is {widths!r}: expected (0.0,) for so many bodies; use fewer")
     solve = levenberg if solver is None else solver
     z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)
-    # The last one twice if noise is estimated: with the guess, then with the estimate from the residuals.
-    again = stages[-1:] if problem.noise else []
-    point: Any = None
-    for number, (width, window) in enumerate([*stages, *again]):
-        noise_now = problem.noise if number < len(stages) else estimated_noise(problem, point, loss)
-        problem = with_noise(problem, noise_now, window, width)
-        point, early = solve(problem.groups, z, loss, iterations, reach, report)
-        z = point.z
-        if early == INTERRUPTED:
-            break
+
+    def through(problem: Problem, z: Numbers, stages: Sequence[tuple[float, float]]) -> tuple[Problem, Point, str]:
+        for width, window in stages:
+            problem = with_noise(problem, problem.noise, window, width)
+            point, early = solve(problem.groups, z, loss, iterations, reach, report)
+            z = point.z
+            if early == INTERRUPTED:
+                break
+        return problem, point, early
+
+    problem, point, early = through(problem, z, stages)
+    leads_in = windows is None and solver is None and early != INTERRUPTED and is_suspect(problem, point, loss)
+    if leads_in:
+        other = through(problem, z, [(problem.width, window) for window in growing(problem)])
+        early = other[2]
+        point = point if early == INTERRUPTED else better(loss, point, other[1])
+    if early != INTERRUPTED and (problem.noise or leads_in):  # with the estimate of the noise from the residuals
+        problem = with_noise(problem, estimated_noise(problem, point, loss))
+        problem, point, early = through(problem, point.z, stages[-1:])
     report(-1, np.asarray(cost_of(loss, point.residuals)))
     return finish(problem, point, loss, intervals, seed, began, [early] if early else [])
 
@@ -171,7 +183,7 @@ def finish(
     if jump := beside_a_jump(problem, point, best, linear, loss):
         remarks = [*jump, *(remark for remark in remarks if remark == INTERRUPTED)]
     remarks = [*remarks, *remarks_on(problem, scenes, in_units), *stuck]
-    parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss)
+    parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss, remarks)
     order, alike = np.argsort(costs), costs <= costs[best] + AGREES + AGREES_RELATIVE * costs[best]
     summary = Summary(
         parameters=parameters, noise=all_noise(problem), costs=costs[order],
@@ -186,21 +198,30 @@ def finish(
 
 
 def _refuse_blind(problem: Problem, linear: Linear, residuals: Sequence[dict[str, np.ndarray]]) -> None:
-    """Raise ValueError for a parameter that no residual depends on, instead of a number with an infinite interval.
+    """Raise ValueError for a parameter that no residual depends on, at the best fit and at the first start.
 
     Where the fit failed, that comes first: a motion far from the measured one says nothing about what is seen.
     """
-    sizes = sum((slopes**2).sum(0) for slopes in linear.slopes)
-    for slot, rows in pieces(problem.slots):
-        if not np.any(sizes[rows] > 0):
+    seen = _seen(problem, linear)
+    if not all(seen.values()):
+        begun = point_at(problem.groups, make_starts(problem, 1, 0))
+        began = _seen(problem, linear_of(problem, begun, 0, SQUARES, False))
+    for slot in problem.slots:
+        if not (seen[slot.name] or began[slot.name]):
             blind = f"nothing that was measured depends on {slot.name} at the best fit"
             if failure := failed(problem, residuals, NOT_SMALL):
-                raise ValueError(f"{failure}. There {blind}")
+                raise ValueError(f"{failure}. Besides, {blind}: begin it elsewhere")
             raise ValueError(
                 f"free: {blind}: "
                 "leave it out, or give a record that shows it: an impact for restitution, one that slips for friction. "
                 "If there is one, begin closer: with less friction, so that it slips in the simulation too"
             )
+
+
+def _seen(problem: Problem, linear: Linear) -> dict[str, bool]:
+    """Whether any residual depends on a parameter."""
+    sizes = sum((slopes**2).sum(0) for slopes in linear.slopes)
+    return {slot.name: bool(np.any(sizes[rows] > 0)) for slot, rows in pieces(problem.slots)}
 
 
 def _printer(progress: bool | None, starts: int) -> Report:

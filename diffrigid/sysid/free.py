@@ -27,7 +27,8 @@ from jax import Array
 from diffrigid.convert import coefficient, known_number, numbers
 from diffrigid.pytree import Number, Vector
 
-NEAR_BOUND = 1e-3  # [-] of an interval: a start on a bound is pulled off it, a result this close is reported
+NEAR_BOUND = 1e-3  # [-] of an interval: a start is pulled so far off a bound, a result this close is reported
+ON_BOUND = 0.1  # [-] likewise a start that is on it: what hardly rebounds comes to rest, and shows no restitution
 PULL = 1e-3  # a start on the bound of a positive parameter begins this far above it, in its unit
 
 
@@ -52,7 +53,9 @@ class Free:
     def unbounded(self, reference: np.ndarray) -> np.ndarray:
         value = np.asarray(reference, float)
         if np.isfinite(self.high):
-            share = np.clip((value - self.low) / (self.high - self.low), NEAR_BOUND, 1.0 - NEAR_BOUND)
+            share = (value - self.low) / (self.high - self.low)
+            off = np.where((share <= 0) | (share >= 1), ON_BOUND, NEAR_BOUND)
+            share = np.clip(share, off, 1.0 - off)
             return np.log(share / (1.0 - share)).ravel()
         if np.isinf(self.low):
             return value.ravel()

@@ -1,6 +1,7 @@
 """The table of a fit: each number with its interval and unit, and notes on what the data cannot determine."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -30,21 +31,23 @@ from diffrigid.sysid.noise import exact_columns
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
 from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
-from diffrigid.sysid.table import BLIND, BOUND
+from diffrigid.sysid.table import BLIND, BOUND, ENDED, STICKS
 from diffrigid.world import World
 
 UNSEEN = 1e-6  # [-] part of a slope along undetermined directions: more is not rounding
 FAINT = 0.1  # [-] of a deviation: residuals that are all smaller do not make intervals too narrow, white or not
+OUTSTANDING = 2.0  # [-] of the median of the records: larger residuals are reported, where residuals are no noise
 CLOSE = 0.95  # [-] correlation from which on two parameters are reported to go together
 
 
 def describe(
     problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
-    residuals: tuple[dict[str, np.ndarray], ...], loss: Loss,
+    residuals: tuple[dict[str, np.ndarray], ...], loss: Loss, remarks: Sequence[str],
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
-    """Parameters with intervals, and the notes under the table."""
+    """Parameters with intervals, and the notes under the table, besides the `remarks` on the fit as a whole."""
     blind = blind_directions(linear, coordinates_of(problem))
-    parameters = tuple(_parameters(problem, shared, own, linear, uncertainty, blind))
+    found = _parameters(problem, shared, own, linear, uncertainty, blind)
+    parameters = tuple(_one_sided(p) if any(r.startswith(p.name + ENDED) for r in remarks) else p for p in found)
     ended = [p.name for p in parameters if p.note == BOUND]
     return parameters, tuple(_notes(problem, linear, uncertainty, blind, ended, residuals, loss))
 
@@ -68,6 +71,11 @@ def _parameters(
         value, low, high = (np.stack(parts) for parts in zip(*triples, strict=True))
         note = _note(slot, value, blind)
         yield Parameter(slot.name, value, low, high, unit_of(problem, slot), note, len(problem.runs))
+
+
+def _one_sided(p: Parameter) -> Parameter:
+    """A friction that ended where what slips begins to stick."""
+    return replace(p, high=np.full_like(p.high, np.inf), note=STICKS)
 
 
 def _notes(
@@ -99,7 +107,19 @@ def _notes(
             given.setdefault(name, []).append(record[name][np.isfinite(record[name])])
     columns = {name: r for name, parts in given.items() if len(r := np.concatenate(parts))}
     wrong = misjudged(columns, max(1.0 - lost / count, LEAST_FREE))  # then columns together are not normal in any case
-    return notes + wrong + doubts(series, bool(wrong) or not isinstance(loss, Squares))
+    doubted = doubts(series, bool(wrong) or not isinstance(loss, Squares))
+    return notes + wrong + doubted + (_worst(residuals) if doubted else [])
+
+
+def _worst(residuals: Sequence[dict[str, np.ndarray]]) -> list[str]:
+    """Remark on records whose residuals are much larger than those of most."""
+    parts = [np.concatenate([column.ravel() for column in record.values()]) for record in residuals]
+    sizes = np.array([np.sqrt(np.mean(part[np.isfinite(part)] ** 2)) for part in parts])
+    worst = np.flatnonzero(sizes > OUTSTANDING * np.median(sizes))
+    if not len(worst):
+        return []
+    named = ", ".join(f"{k} ({sizes[k] / np.median(sizes):.2g} times)" for k in worst[:3])
+    return [f"residuals are larger than in most records in {named}{', ...' if len(worst) > 3 else ''}"]
 
 
 def coordinates_of(problem: Problem) -> list[Coordinate]:

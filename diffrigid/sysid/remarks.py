@@ -26,6 +26,7 @@ from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.problem import full_turn
 from diffrigid.sysid.records import Run
 from diffrigid.sysid.setup import Problem
+from diffrigid.sysid.table import ENDED
 from diffrigid.world import World, seats
 
 AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are autocorrelated, mean that the fit failed
@@ -68,8 +69,8 @@ def sticking(problem: Problem, point: Point, best: int, linear: Linear, covarian
         slopes = linear_of(problem, above, best, Squares(), False).slopes
         if sum((jacobian[:, one] ** 2).sum() for jacobian in slopes) < ONE_SIDED * information[one]:
             out.append(
-                f"{slot.name} ended where what slips begins to stick: larger values fit as well, whatever the upper "
-                f'end of its interval; see dr.profile(fit, "{slot.name}")'
+                f"{slot.name}{ENDED}: larger values fit as well, and the lower end of its interval is of slopes beside "
+                f'a kink; see dr.profile(fit, "{slot.name}")'
             )
     return out
 

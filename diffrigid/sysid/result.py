@@ -238,7 +238,7 @@ class Fit:
         check_intervals(intervals)
         uncertainty = intervals(self.linear)
         parameters, notes = describe(
-            self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.loss
+            self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.loss, self.remarks
         )
         summary = replace(self.summary, parameters=parameters, notes=(*self.remarks, *notes))
         return replace(self, summary=summary, uncertainty=uncertainty)

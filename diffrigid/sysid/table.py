@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 HEADER = ("parameter", "value", "95 % interval", "unit", "")
 BLIND = "not determined, see below"  # note of a parameter with a number that has no interval
+STICKS = "larger values fit as well, see below"  # likewise of a friction that ended where what slipped sticks
+ENDED = " ended where what slips begins to stick"  # behind its name, the beginning of the remark on it
 BOUND = "at its bound"  # note of a parameter that ended there
 DOUBTS = ("the fit failed", "not converged", "the cost jumps")  # beginnings of notes that concern every number
 TABLE_RECORDS = 3  # records whose own numbers are in the table
