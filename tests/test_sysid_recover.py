@@ -29,7 +29,8 @@ def missing(random, values, noise):
 def test_a_friction_at_the_end_of_slip_has_no_upper_limit():
     """A disc that sticks when it strikes from some friction on: just below it all larger ones fit as well.
 
-    Without friction the fit ends at the lower bound, where larger ones do not fit.
+    Beyond it nothing depends on the friction, which it does where the fit begins. Without friction the fit ends at the
+    lower bound, where larger ones do not fit.
     """
 
     def disc(friction):
@@ -40,11 +41,13 @@ def test_a_friction_at_the_end_of_slip_has_no_upper_limit():
     sticks = 2.0 / (3.0 * 1.7 * np.sqrt(2 * 9.81 * 0.9))  # v / 3 over (1 + e) times the speed of the impact
     t = np.arange(36) / 60
     free = {"friction": dr.interval(0, 1)}
-    ends = ("larger values fit as well", "friction ended at a bound")
-    for share, said in ((0.995, ends[0]), (0.8, ""), (0.0, ends[1])):
+    ends = ("begins to stick: larger values fit as well", "friction ended at a bound", "nothing slips")
+    for share, said in ((0.995, ends[0]), (0.8, ""), (0.0, ends[1]), (1.3, ends[2])):
         measured = np.asarray(dr.rollout(*disc(share * sticks), dt=1 / 60, steps=35)["ball.x"])
-        guess, data = disc(max(share, 0.1) * sticks), {"t": t, "ball.x": measured}
-        notes = repr(dr.fit(*guess, data, free=free, noise={"ball.x": 1e-3}, progress=False))
+        guess, data = disc(np.clip(share, 0.1, 0.995) * sticks), {"t": t, "ball.x": measured}
+        found = dr.fit(*guess, data, free=free, noise={"ball.x": 1e-3}, progress=False)
+        assert (found["friction"].high == 1.0) == bool(said)
+        notes = repr(found)
         assert [words in notes for words in ends] == [words == said for words in ends]
         assert "hardly seen" not in notes
 

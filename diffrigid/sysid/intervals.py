@@ -46,8 +46,11 @@ def describe(
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """Parameters with intervals, and the notes under the table, besides the `remarks` on the fit as a whole."""
     blind = blind_directions(linear, coordinates_of(problem))
-    found = _parameters(problem, shared, own, linear, uncertainty, blind)
-    parameters = tuple(_one_sided(p) if any(r.startswith(p.name + ENDED) for r in remarks) else p for p in found)
+    found = tuple(_parameters(problem, shared, own, linear, uncertainty, blind))
+    parameters = tuple(
+        _sticks(p, slot) if any(r.startswith(p.name + ENDED) for r in remarks) else p
+        for p, slot in zip(found, problem.slots, strict=True)
+    )
     ended = [p.name for p in parameters if p.note == BOUND]
     return parameters, tuple(_notes(problem, linear, uncertainty, blind, ended, residuals, loss))
 
@@ -73,9 +76,10 @@ def _parameters(
         yield Parameter(slot.name, value, low, high, unit_of(problem, slot), note, len(problem.runs))
 
 
-def _one_sided(p: Parameter) -> Parameter:
-    """A friction that ended where what slips begins to stick."""
-    return replace(p, high=np.full_like(p.high, np.inf), note=STICKS)
+def _sticks(p: Parameter, slot: Slot) -> Parameter:
+    """A friction that ended where what slips begins to stick: it may be as large as its kind allows."""
+    most = slot.kind.high if isinstance(slot.kind, Free) else np.inf
+    return replace(p, high=np.full_like(p.high, most), note=STICKS)
 
 
 def _notes(
