@@ -151,6 +151,31 @@ def test_slider_rod_and_weld():
 # ---- contact
 
 
+@pytest.mark.slow
+def test_a_block_slips_both_ways_on_a_plank_that_a_motor_pulls():
+    """The motor never reaches its speed: until the slip is zero the block drags the plank along, from then on back."""
+
+    def end(force, speed):
+        plank = dr.Body(dr.Box(half=(1.5, 0.05)), mass=1.28, x=(0.0, 0.0), v=jnp.stack([speed, 0.0]))
+        block = dr.Body(dr.Box(half=(0.15, 0.05)), mass=1.087, x=(0.0, 0.1), v=(1.95, 0.0))
+        motor = dr.Prismatic("plank", axis_b=(1.0, 0.0), speed=100.0, friction=force)
+        scene = dr.scene({"plank": plank, "block": block}, gravity=(0.0, -9.81), friction=0.15, joints=[motor])
+        state = dr.rollout(*scene, dt=1 / 60, steps=30).state
+        return jnp.concatenate([state.x[-1, :, 0], state.v[-1, :, 0]])
+
+    def exact(force, speed):
+        mass, v = jnp.array([1.28, 1.087]), jnp.stack([speed, 1.95])
+        pull, rub = jnp.stack([force, 0.0]), 0.15 * 1.087 * 9.81 * jnp.array([1.0, -1.0])
+        before, after = (pull + rub) / mass, (pull - rub) / mass
+        slips = (v[1] - v[0]) / (before[0] - before[1])
+        there, then = v + before * slips, 0.5 - slips
+        return jnp.concatenate([0.5 * (v + there) * slips + there * then + 0.5 * after * then**2, there + after * then])
+
+    (got, slopes), (expected, true_slopes) = (with_slopes(f)(8.62, -0.937) for f in (end, exact))
+    assert_allclose(got, expected, rtol=1e-12)
+    assert_allclose(jnp.stack(slopes), jnp.stack(true_slopes), rtol=1e-9)
+
+
 def test_hinged_rod_rebounds():
     """No gravity: the tip strikes a wall, w -> -e w at once, whatever the hinge takes up; exact, with its slopes."""
 

@@ -79,11 +79,20 @@ def slips_and_rolls(dim, mu, c, v, slope, t):
     return way + rolls(dim, mu, c, v - braking * slips, slope, t - slips)
 
 
+def slips_both_ways(dim, mu, c, v, slope, t):
+    """Up a slope that is too steep for rolling: the slip falls to zero, and goes on the other way."""
+    up, rub, torque = -jnp.sin(slope), mu * jnp.cos(slope), c / RADIUS * jnp.cos(slope)
+    slips = v / G / (rub + up + (rub - torque) / SHARE[dim])
+    there, then = v - G * (rub + up) * slips, t - slips
+    return 0.5 * (v + there) * slips + there * then - 0.5 * G * (up - rub) * then**2
+
+
 CASES = {
     "rolls on": (rolls, (0.5, 0.02, 1.0, 0.0, 1.0)),
     "stops within a step": (rolls, (0.5, 0.1, 1.0, 0.0, 0.97)),
     "turns back on a slope": (rolls_back, (0.5, 0.02, 1.0, -0.25, 1.0)),
     "slips at first": (slips_and_rolls, (0.3, 0.02, 3.0, 0.0, 1.0)),
+    "slips both ways up a slope": (slips_both_ways, (0.1, 0.005, 3.0, -0.5, 0.6)),
     "is held on a slope": (rolls, (0.5, 0.29 * RADIUS, 0.0, 0.28, 1.0)),
     "rolls down a slope": (rolls, (0.5, 0.27 * RADIUS, 0.0, 0.28, 1.0)),
 }

@@ -18,7 +18,7 @@ from diffrigid.branches import any_world
 from diffrigid.contact.cone import put, split, turning, without_turning
 from diffrigid.contact.mobility import Mobility, moved, relative_changes
 from diffrigid.contact.resting import Law, Strikes
-from diffrigid.contact.slipping import in_all, least_slip, most_resisting, reversal, rubbing, slips
+from diffrigid.contact.slipping import in_all, least_slip, most_resisting, pulled, reversal, rubbing, slips
 from diffrigid.numerics import dot, norm, normalise, safe_divide
 from diffrigid.pytree import array, pytree, replace
 
@@ -61,24 +61,27 @@ def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tupl
 
 
 def reversing(
-    mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array, rest_speed: Array
-) -> Known:
+    mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array,
+    rest_speed: Array, by_torques: Array | float = 0.0,
+) -> Known:  # fmt: skip
     """Friction where a slip stops and reverses within T, from trial impulses P with friction acting one way.
 
     See `reversal`. How much the full bound brakes the slip follows from the trial impulses.
 
     Args:
-        changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P.
+        changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P and by torques of rolling rows.
+        by_torques: (C, D, *batch) [m/s] what v_rel gains by the latter, which `strikes` have already.
     """
     held, heaviest = strikes.active & strikes.held & (T > 0), most_resisting(mobility, strikes)
 
     def found(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
-        friction, bounds = rubbing(strikes, P, law)
-        at_end, slip = slips(friction, strikes, law.target, T)
+        (friction, bounds), (free, by) = rubbing(strikes, P, law), pulled(mobility, strikes, P, law.most, T)
+        at_end, slip = slips(friction, free, law.target, T)
         back = jax.vmap(normalise)(at_end - slip)
         rubbed = friction(P)
         against, braked, own = (
-            -jax.vmap(dot)(r, back) for r in (slip, friction(relative_changes(strikes, *changes)), rubbed)
+            -jax.vmap(dot)(r, back)
+            for r in (slip, friction(relative_changes(strikes, *changes) - by - by_torques), rubbed)
         )
         stops = held & (against > least_slip(rest_speed)[None])
         # How the full bound brakes the slip, inferred from those impulses if they tell: where friction at all contacts

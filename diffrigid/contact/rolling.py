@@ -120,8 +120,8 @@ def rolling_reversing(
 
     Spinning about the normal is left out: no force at a contact turns it back. Exact for one contact of two bodies.
     """
-    free, others = _contacts_alone(mobility, strikes, P, T)
-    slips = reversing(mobility, free, others(P), changes, others(law), others(T), rest_speed)
+    free, others, by_torques = _contacts_alone(mobility, strikes, P, T)
+    slips = reversing(mobility, free, others(P), changes, others(law), others(T), rest_speed, by_torques)
     sticks, pair, of_rows = _sticks(strikes, P, law.mu), rows_of(strikes), turning(strikes.spin, T)
     part, bound = _parts(strikes, P, law.mu)[-1]
     slip, at_end = (part(pair.normal, turn) for turn in _turns(mobility, strikes, sticks, P, T))
@@ -211,13 +211,14 @@ def _with_reaction(mobility: Mobility, strikes: Strikes, sticks: Array, torque: 
 def _of_slips(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: Array, rest_speed: Array) -> Array:
     """`stopping_early` of contacts and rows of joints, with the torques of the rolling rows as an even pull."""
     spin, count = strikes.spin, len(strikes.spin)
-    free, others = _contacts_alone(mobility, strikes, P, T)
+    free, others, _ = _contacts_alone(mobility, strikes, P, T)
     early = stopping_early(mobility, free, others(P), others(law), others(T), rest_speed)
     return jnp.concatenate([early[:count], jnp.zeros_like(turning(spin, P)), early[count:]])
 
 
-def _contacts_alone(mobility: Mobility, strikes: Strikes, P: Array, T: Array) -> tuple[Strikes, Callable]:
-    """Contacts and rows of joints, with the torques of rolling rows as an even pull; a map of values to theirs."""
+def _contacts_alone(mobility: Mobility, strikes: Strikes, P: Array, T: Array) -> tuple[Strikes, Callable, Array]:
+    """Contacts and rows of joints, with the torques of rolling rows as an even pull; a map of values to theirs; what
+    their v_rel gains by it."""
     spin, count = strikes.spin, len(strikes.spin)
     by_torque = moved(put(spin, jnp.zeros_like(P), turning(spin, P)), strikes, mobility)
     pull = strikes.pull + by_torque / jnp.where(T > 0, T, 1.0)[:, None]
@@ -227,4 +228,4 @@ def _contacts_alone(mobility: Mobility, strikes: Strikes, P: Array, T: Array) ->
 
     free = others(replace(_arrays(strikes), v_rel=strikes.v_rel + by_torque, pull=pull))
     a, b, wholes = (of_all[:count] + of_all[2 * count :] for of_all in (strikes.a, strikes.b, strikes.wholes))
-    return replace(free, a=a, b=b, wholes=wholes, jac=strikes.jac, mid_jac=strikes.mid_jac), others
+    return replace(free, a=a, b=b, wholes=wholes, jac=strikes.jac, mid_jac=strikes.mid_jac), others, others(by_torque)

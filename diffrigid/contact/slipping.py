@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.contact.cone import put, split, turning
-from diffrigid.contact.mobility import Mobility, momentum_changes
+from diffrigid.contact.mobility import Mobility, momentum_changes, moved
 from diffrigid.contact.resting import Law, Strikes
 from diffrigid.contact.sums import alike, at_colliders
 from diffrigid.gathers import constant, sum_rows
@@ -44,6 +44,7 @@ def stopping_early(mobility: Mobility, strikes: Strikes, P: Array, law: Law, T: 
     braking part acts earlier, with its centroid at tau / 2 instead of T / 2, so it moves the contact further, by
     (T - tau) / 2 times its change of velocity. Exact for one direction of slip under a constant pull.
     """
+    strikes, _ = pulled(mobility, strikes, P, law.most, T)
     (part, bounds), most = rubbing(strikes, P, law), law.most
     at_end, slip = slips(part, strikes, law.target, T)
     most_to_stop = most_resisting(mobility, strikes) * jax.vmap(norm)(at_end)
@@ -67,6 +68,21 @@ def rubbing(strikes: Strikes, P: Array, law: Law) -> tuple[Callable, Array]:
         return across, bounds
     of_joint = jnp.isfinite(most)
     return lambda r: jnp.where(of_joint[:, None], r, across(r)), jnp.where(of_joint, most, bounds)
+
+
+def pulled(mobility: Mobility, strikes: Strikes, P: Array, most: Array | None, T: Array) -> tuple[Strikes, Array]:
+    """Strikes with the pull on contacts by rows of joints that push with all they have, and what v_rel gains by it.
+
+    A motor or joint friction that does not hold its speed acts as a constant force.
+    """
+    if most is None:
+        return strikes, jnp.zeros_like(P)
+    limited = jnp.isfinite(most)
+    pushes = limited & (jax.vmap(norm)(P) >= STICKS * jnp.where(limited, most, 0.0))
+    by = moved(jnp.where(pushes[:, None], P, 0.0), strikes, mobility)
+    by = jnp.where(limited[:, None], 0.0, by)
+    pull = strikes.pull + by / jnp.where(T > 0, T, 1.0)[:, None]
+    return replace(strikes, v_rel=strikes.v_rel + by, pull=pull), by
 
 
 def slips(part: Callable, strikes: Strikes, target: Array, T: Array) -> tuple[Array, Array]:
