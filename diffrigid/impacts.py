@@ -34,6 +34,7 @@ BEYOND = 1.1  # [-] times the sizes,
 FASTER = 1.5  # [-] and times the path at the first speed: what is further apart does not meet
 NO_SIZE = 1e-9  # [m, N s] where there is no size, no force
 WORK = 4_000_000  # pairs times intervals beyond which not all stored times are examined
+SUPPORTED = 1.2  # [-] of the impulse of the forces: a support balances them, an impact changes the momentum by more
 ROUGH = 5.0  # [-] an impulse that exceeds that of the forces in an interval by this factor is an impact
 
 
@@ -82,6 +83,7 @@ class Sampled(NamedTuple):
     q: np.ndarray  # (T+1, N + S, Q)
     v: np.ndarray  # (T+1, N + S, D)
     w: np.ndarray  # (T+1, N + S, A)
+    a: np.ndarray  # (T, N + S, D) [m/s^2] before an impact in the interval; 0 where the change may be that of a support
 
 
 def _numbers(vector: np.ndarray) -> str:
@@ -118,7 +120,8 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     world, dim = trajectory.world, trajectory.world.dim
     names = world.names + world.static_names
     some = _thinned(trajectory)
-    motion, changes = _motion(some), changes_of(some)
+    changes = changes_of(some)
+    motion = _motion(some, changes)
     groups = [group for group in world.pairs if not isinstance(world.shapes[group.shape_b], UNEVEN)]
     found = [_touches(world, group, motion, changes) for group in groups]
     touch = Touch(*(np.concatenate(parts) for parts in zip(*found, strict=True))) if found else None
@@ -166,7 +169,7 @@ def _thinned(trajectory: Trajectory) -> Trajectory:
     return replace(trajectory, t=t, state=state, controls=controls)
 
 
-def _motion(trajectory: Trajectory) -> Sampled:
+def _motion(trajectory: Trajectory, changes: Changes) -> Sampled:
     state, still = trajectory.state, trajectory.world.statics
     count, steps = len(trajectory.world.static_names), len(trajectory.t)
 
@@ -174,7 +177,9 @@ def _motion(trajectory: Trajectory) -> Sampled:
         return np.concatenate([moving, np.broadcast_to(rest, (steps, count, moving.shape[2]))], axis=1)
 
     x, q = (joined(*both) for both in ((state.x, np.asarray(still.x, float)), (state.q, np.asarray(still.q, float))))
-    return Sampled(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0))
+    hit = np.linalg.norm(changes.p, axis=2) > SUPPORTED * changes.push
+    a = np.concatenate([hit[..., None] * changes.fall, np.zeros((steps - 1, count, x.shape[2]))], axis=1)
+    return Sampled(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0), a)
 
 
 def _touches(world: World, group: Any, motion: Sampled, changes: Changes) -> Touch:
@@ -241,8 +246,10 @@ def _box_faces() -> tuple:
 
 
 def _flown(motion: Sampled, k: np.ndarray, body: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (M, D), (M, Q) after a free flight of s (M,) without forces, which is near enough within an interval."""
-    x, q, w = motion.x[k, body] + s[:, None] * motion.v[k, body], motion.q[k, body], s[:, None] * motion.w[k, body]
+    """Poses (M, D), (M, Q) after a free flight of s (M,) without torques, which is near enough within an interval."""
+    s = s[:, None]
+    x = motion.x[k, body] + s * (motion.v[k, body] + 0.5 * s * motion.a[k, body])
+    q, w = motion.q[k, body], s * motion.w[k, body]
     if q.shape[1] == 2:
         c, u = np.cos(w[:, 0]), np.sin(w[:, 0])
         return x, np.stack([c * q[:, 0] - u * q[:, 1], u * q[:, 0] + c * q[:, 1]], axis=1)

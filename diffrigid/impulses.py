@@ -50,6 +50,7 @@ class Changes(NamedTuple):
 
     p: np.ndarray  # (T, N, D) [N s] beyond what the forces do
     L: np.ndarray  # (T, N, A) [N m s] likewise
+    fall: np.ndarray  # (T, N, D) [m/s^2] by the forces
     push: np.ndarray  # (T, N) [N s] size of the impulse of the forces, on it or on what joints connect it with
     joints: Joints
 
@@ -68,7 +69,8 @@ def changes_of(trajectory: Trajectory) -> Changes:
     for bodies in set(islands(ends, len(world.names))):
         push[:, bodies] = push[:, bodies].max(1, keepdims=True)
     joints = Joints(np.array(ends, int).reshape(-1, 2).T, made)
-    return Changes(change[..., :dim], change[..., dim:], push, joints)
+    fall = forces[..., :dim] / (np.asarray(world.bodies.mass, float)[:, None] * h[:, None, None])
+    return Changes(change[..., :dim], change[..., dim:], fall, push, joints)
 
 
 def impulses_at(changes: Changes, interval: np.ndarray, ends: np.ndarray, arms: np.ndarray) -> np.ndarray:

@@ -148,6 +148,17 @@ def test_points_that_carry_a_body_carry_its_weight(dim, points):
     assert abs(moment) < 1e-6
 
 
+def test_impacts_are_found_wherever_in_an_interval_they_are():
+    """Just before its end too, where a flight without gravity would not have met the floor yet."""
+    floor = dr.Static(dr.HalfSpace(normal=(0.0, 1.0)))
+    for fall in np.linspace(0.2, 0.8, 60):  # [s] until the first impact
+        ball = dr.Body(dr.Disc(radius=0.05), mass=0.2, x=(0.0, 0.05 + 0.5 * G * fall**2))
+        scene = dr.scene({"ball": ball, "floor": floor}, gravity=(0.0, -G), restitution=0.3)
+        found = dr.contacts(dr.rollout(*scene, dt=1 / 60, steps=80))
+        strikes = fall * np.array([1.0, 1.6])
+        np.testing.assert_allclose(found.t[found.impact][:2], strikes, atol=1e-5)
+
+
 def pressed(bodies, joints, step=0.01, **scene):
     """The contact of a motion that stays as it is at the start: its force on the first body [N]."""
     world, state = dr.scene(bodies, joints=joints, **scene)
