@@ -250,7 +250,7 @@ GOOD = {"t": T, "cue.x": np.zeros((6, 2))}
         ({"t": T, "cue.x": ["0", "lost", *"2345"]}, {}, "with 'lost' in row 1"),
         (GOOD | {"cue.x": np.zeros((6, 3))}, {}, r"expected \(6, 2\) like t in this 2D world"),
         (GOOD | {"cue.x[0]": T}, {}, "leave one out"),
-        ({"t": T, "cue.x[2]": T}, {}, r"component \[2\] of 2"),
+        ({"t": T, "cue.x[2]": T}, {}, r"component \[2\], expected \[0\] to \[1\]"),
         (GOOD | {"cu.x": T}, {}, "did you mean 'cue.x'"),
         *(
             (GOOD | {name: T}, {}, r"did you mean 'ball.x\[1\]'")

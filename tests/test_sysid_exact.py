@@ -297,6 +297,8 @@ def test_a_saved_fit_is_read_back_and_resumed(fit, records, tmp_path):
     assert {"diffrigid", "jax", "numpy"} <= set(json.loads((tmp_path / "fit.json").read_text())["versions"])
     again = dr.fit(*point(), records, free=FREE, progress=False, resume=saved, iterations=1)
     assert_allclose(again["p.x"].value, fit["p.x"].value, atol=1e-6)
+    with pytest.raises(ValueError, match="resume is a fit of .*p.x.*: expected one of some that are free here"):
+        dr.fit(*point(), records, free={"p.mass": dr.positive()}, progress=False, resume=saved)
     for use in (lambda fit: dr.profile(fit, "gravity"), dr.sample, sysid.jumps):
         with pytest.raises(ValueError, match=r"expected a Fit; what load_fit read is its table only: dr.fit\("):
             use(saved)
@@ -382,6 +384,17 @@ def test_prediction_takes_the_steps_of_the_fit():
     assert_allclose(found.predict(times=[late + 1.0]).state.x[0, 0, 0], np.cos(2.0), atol=1e-4)
     with pytest.raises(ValueError, match="expected increasing times from 1.7e.09 s on, where record 0 starts"):
         found.predict(times=[1.0, 2.0])
+
+
+def test_a_later_part_of_a_record_is_scored_from_the_start_of_the_motion():
+    scene = dr.scene({"p": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 0.0), v=(1.0, 0.0))})
+    t = np.arange(40) / 20
+    x = np.stack([t, 0 * t], 1) + 1e-3 * np.random.default_rng(0).normal(size=(40, 2))
+    found = dr.fit(*scene, {"t": t[:20], "p.x": x[:20]}, free={"p.v": dr.real()}, progress=False)
+    later = {"t": t[20:], "p.x": x[20:]}
+    with pytest.warns(UserWarning, match=r"record 0 began at the fitted start, at its first row; .*start=0.0"):
+        assert found.score(later)["p.x"] > 0.5
+    assert found.score(dr.Record(later, start=0.0))["p.x"] < 2e-3
 
 
 def test_records_that_were_fitted_are_scored_from_what_was_found(fit, records, monkeypatch):
@@ -485,7 +498,7 @@ def test_design_finds_the_launch_that_tells_most():
     best = found.parameters[0]
     assert best.high - best.low < 0.5 * (here.high - here.low)
     lines = [line.split() for line in repr(found).splitlines()]
-    assert ["p.x[0]", f"{found.values['p.x'][0]:.4g}", "m"] in lines
+    assert ["p.x[0]", f"{found.values['p.x'][0]:.4g}", "m", "at", "a", "bound"] in lines
     assert any(line[0] == "spring.stiffness" and line[-1] == "N/m" for line in lines if line)
     # Seen twice by a column of one number and another of its own name; what is NaN throughout will not be measured.
     planned = {"t": t, "p.x[0]": None, "p.x[1]": np.full(30, np.nan), "far": None, "p.angle": np.full(30, np.nan)}

@@ -132,8 +132,7 @@ def _by_name(name: str, what: str, world: World) -> Any:
         raise ValueError(
             f"observations: no column {name!r} in this {world.dim}D world"
             + ("" if name == what else f", which observes {what!r}")
-            + f": {_hint(what, possible)} Say what other columns observe by observe={{{name!r}: ...}}; "
-            "None leaves it out."
+            + f": say what it observes by observe={{{name!r}: ...}}, None leaves it out; {_hint(what, possible)}"
         )
     return possible[wanted]
 

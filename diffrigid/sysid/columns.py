@@ -45,7 +45,7 @@ def columns(
     shared = None if "t" not in table else as_times(table.pop("t"), f'{where}["t"]')
     gathered = _gather(table)
     if shared is None and not any(isinstance(values, tuple) for values in gathered.values()):
-        raise ValueError(f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours')
+        raise ValueError(f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours, {{"t": ...}}')
     found, channels, controls, sizes = [], {}, [], controlled(world.forces)
     for name, values in gathered.items():
         if isinstance(values, tuple) and len(values) == 2:
@@ -210,7 +210,7 @@ def _filled(values: Any, rows: int, size: int, name: str, where: str, world: Wor
     where = f"{where}[{name!r}]"
     if isinstance(values, dict):
         if bad := [index for index in values if index >= size]:
-            raise ValueError(f"{where}: component [{bad[0]}] of {size} in this {world.dim}D world")
+            raise ValueError(f"{where}: component [{bad[0]}], expected [0] to [{size - 1}] in this {world.dim}D world")
         whole = np.full((rows, size), np.nan)
         for index, part in values.items():
             part = as_floats(part, f"{where}[{index}]")

@@ -43,6 +43,7 @@ class Launch:
     world: World
     state: State
     values: dict[str, np.ndarray]  # of the varied parameters, by name
+    edges: tuple[str, ...]  # of them, those that ended at a bound of their interval
     parameters: tuple[Parameter, ...]  # at their present values, with the interval to expect
     score: float  # mean logarithm of the standard deviations of z; -1 is intervals e times as narrow
 
@@ -52,12 +53,13 @@ class Launch:
                 name + "".join(f"[{k}]" for k in index),
                 f"{value[index]:.4g}",
                 unit(self.world, name.split(" ")[0]) or "-",
+                "at a bound" if name in self.edges else "",
             )
             for name, value in self.values.items()
             for index in np.ndindex(value.shape)
         ]
         expected = [row[:4] for parameter in self.parameters for row in rows_of(parameter)]
-        return "\n".join([*lined_up(("launch", "value", "unit"), launch), "", *lined_up(EXPECTED, expected)])
+        return "\n".join([*lined_up(("launch", "value", "unit", ""), launch), "", *lined_up(EXPECTED, expected)])
 
 
 def expected_intervals(
@@ -159,7 +161,8 @@ def best_launch(
     best = launched(u)
     values = {slot.name: np.asarray(reference(slot, best)) for slot in slots}
     found = expected_intervals(best.world, best.state, planned, free=free, noise=noise, observe=observe, dt=dt)
-    return Launch(best.world, best.state, values, found, score)
+    edges = tuple(slot.name for slot in slots if slot.kind.at_bound(values[slot.name]))
+    return Launch(best.world, best.state, values, edges, found, score)
 
 
 def _descended(scores: Callable, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:

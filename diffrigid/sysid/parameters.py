@@ -23,6 +23,8 @@ from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.sensors import Channel, is_turn
 from diffrigid.world import World
 
+UNIT = {"normal": "direction", "axis_a": "direction", "axis_b": "direction", "q": "rotation", "zero": "rotation"}
+
 
 class Scene(NamedTuple):
     """World, state and columns: all that parameters are part of."""
@@ -183,8 +185,11 @@ def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unli
         raise ValueError(f"free[{key!r}]: paths of shapes {sorted(shapes)}, expected {expected}")
     shape = reference(slot, having[0]).shape
     size = kind.size(shape)
-    if isinstance(kind, Chart) and kind.name == "rotation" and not names[0].endswith((".q", ".zero")):
+    field = component(names[0])[0].rpartition(".")[2]
+    if isinstance(kind, Chart) and kind.name == "rotation" and UNIT.get(field) != "rotation":
         raise ValueError(f"free[{key!r}]: rotation() is for orientations, such as 'die.q'")
+    if isinstance(kind, Free) and field in UNIT:
+        raise ValueError(f"free[{key!r}]: expected {UNIT[field]}(), which keeps its length")
     if isinstance(kind, Free) and component(names[0])[0].endswith(".inertia") and having[0].world.dim == 3:
         raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
     for scene in having:

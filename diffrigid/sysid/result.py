@@ -160,8 +160,9 @@ class Fit:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
 
         Parameters that each record has of its own are fitted anew. The first start is the `state` of the record if it
-        has one, otherwise the state that its first rows show, otherwise (with a warning if the score is poor) the
-        fitted state of record 0. A record that was part of the fit starts from its fitted values.
+        has one, otherwise the state that its first rows show, if that is free by `each`, otherwise (with a warning if
+        the score is poor) the fitted state of record 0. A record that was part of the fit starts from its fitted
+        values. The motion starts at the first row: a later part of a record is `Record(data, start=...)`.
 
         Args:
             observations: one record or several, as `fit` takes them.
@@ -192,11 +193,12 @@ class Fit:
         }
         sizes = {name: float(np.sqrt(np.nanmean(residuals**2))) for name, residuals in values.items()}
         borrowed = [k for k, run in enumerate(problem.runs) if not (fitted[k] or is_begun(run, problem.own))]
-        self._warn_of_starts(sizes, borrowed)
+        late = [] if problem.own else [k for k, run in enumerate(problem.runs) if not (fitted[k] or run.stated)]
+        self._warn_of_starts(sizes, borrowed, late)
         return sizes
 
-    def _warn_of_starts(self, sizes: dict[str, float], borrowed: list[int]) -> None:
-        """Warn if a score is poor where records began at the state of the first record of the fit."""
+    def _warn_of_starts(self, sizes: dict[str, float], borrowed: list[int], late: list[int]) -> None:
+        """Warn if a score is poor where records began at the state of the first record of the fit, perhaps too late."""
         ratios = {name: size / self.noise.get(name, np.inf) for name, size in sizes.items()}
         worst = max(ratios, key=lambda name: ratios[name])
         if borrowed and ratios[worst] > POOR:
@@ -204,6 +206,13 @@ class Fit:
                 f"score: residuals of {worst} are {ratios[worst]:.2g} times the noise of the fit, but record "
                 f"{borrowed[0]} began at the fitted state of record 0 of the fit, as its first rows do not show one: "
                 "give it a first guess, dr.Record(..., state=first), or more starts",
+                stacklevel=3,
+            )
+        elif late and ratios[worst] > POOR:
+            warnings.warn(
+                f"score: residuals of {worst} are {ratios[worst]:.2g} times the noise of the fit: record {late[0]} "
+                "began at the fitted start, at its first row; if that is later, give dr.Record(..., start=0.0), with "
+                "the time of the start",
                 stacklevel=3,
             )
 
