@@ -111,6 +111,8 @@ class Contact:
             # Each branch has its end: for one behind both, reverse mode would run the passes twice.
             others, none = map(jax.checkpoint, (lambda *of: end(passes(*of)), lambda start, _: end(start)))
             return lax.cond(done < self.sweeps, others, none, start, done)
+        if all(driven(world)):
+            return end(passes(start))
         near = may_meet(world, launch(state, t0), dt)
         return end(lax.cond(near, passes, lambda start: start, start))
 
@@ -141,8 +143,9 @@ class Contact:
         return checkpoint_name(lax.scan(maybe, first, phases)[0].anchors, PASSED)
 
     def _phases(self, world: "World") -> list[int]:
-        impacts, loaded = self.sweeps + HOLDS * waits(world), is_loaded(world)
-        return [IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH]
+        rows_only, loaded = all(driven(world)), is_loaded(world)  # motors and joint friction: no impacts, no gaps
+        impacts = 0 if rows_only else self.sweeps + HOLDS * waits(world)
+        return [IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH] * (not rows_only)
 
     def saved_numbers(self, world: "World") -> int:
         """Approximate count of numbers saved per step (FOUND, PASSED) for reverse mode without recomputing the step."""

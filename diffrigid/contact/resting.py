@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -9,10 +10,10 @@ from diffrigid.branches import any_world
 from diffrigid.contact.cone import Cone
 from diffrigid.contact.gain import solve_without_gain
 from diffrigid.contact.impulse import impulses
-from diffrigid.contact.mobility import Arms, Mobility
+from diffrigid.contact.mobility import Arms, Mobility, moved
 from diffrigid.contact.sums import at_colliders
 from diffrigid.gathers import flags
-from diffrigid.numerics import recomputed, safe_divide, safe_sqrt
+from diffrigid.numerics import dot, recomputed, safe_divide, safe_sqrt
 from diffrigid.pytree import array, pytree, static
 
 
@@ -73,6 +74,8 @@ def solve_impulses(
     target, mu, most = law
     if not mobility.joined and are_alone(strikes.a, strikes.b, len(count)):
         return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu)
+    if most is not None and len(strikes.a) == 1:
+        return _only_row(strikes, law, mobility)
     joined = tuple(not mobility.joined.isdisjoint(pair) for pair in zip(strikes.a, strikes.b, strict=True))
     others = jnp.maximum(at_colliders(count, strikes.a, 1.0), at_colliders(count, strikes.b, 1.0))
     others = lax.stop_gradient(others)
@@ -85,12 +88,23 @@ def solve_impulses(
         on=shared.astype(others.dtype), sharing=jnp.maximum(others, 1.0), scale=_scale(strikes), normal=strikes.normal,
         target=target, mu=mu, most=most, spin=strikes.spin, rest_speed=rest_speed,
     )  # fmt: skip
-    arms = Arms(
+    deep = strikes.gap < -strikes.deepest
+    return alone + solve_without_gain(cone, deep, strikes.v_rel, guess, _arms(strikes), mobility)
+
+
+def _arms(strikes: Strikes) -> Arms:
+    return Arms(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, mid_a=strikes.mid_a, mid_b=strikes.mid_b, turn=strikes.turn,
         jac=strikes.jac, mid_jac=strikes.mid_jac, spin=strikes.spin, a=strikes.a, b=strikes.b,
     )  # fmt: skip
-    deep = strikes.gap < -strikes.deepest
-    return alone + solve_without_gain(cone, deep, strikes.v_rel, guess, arms, mobility)
+
+
+def _only_row(strikes: Strikes, law: Law, mobility: Mobility) -> Array:
+    """Impulse of the only row of a world, (1, D, *batch) [N s]: a motor or the dry friction of one joint."""
+    n, on = strikes.normal, strikes.active[:, None]
+    per_impulse = jax.vmap(dot)(n, moved(n, _arms(strikes), mobility))
+    wanted = safe_divide(law.target - jax.vmap(dot)(n, strikes.v_rel), per_impulse)
+    return jnp.where(on, jnp.clip(wanted, -law.most, law.most)[:, None] * n, 0.0)
 
 
 def barely(strikes: Strikes, rest_speed: Array) -> Array:
