@@ -75,7 +75,7 @@ def solve_impulses(
     if not mobility.joined and are_alone(strikes.a, strikes.b, len(count)):
         return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu)
     if most is not None and len(strikes.a) == 1:
-        return _only_row(strikes, law, mobility)
+        return _only_row(strikes, target, most, mobility)
     joined = tuple(not mobility.joined.isdisjoint(pair) for pair in zip(strikes.a, strikes.b, strict=True))
     others = jnp.maximum(at_colliders(count, strikes.a, 1.0), at_colliders(count, strikes.b, 1.0))
     others = lax.stop_gradient(others)
@@ -99,12 +99,12 @@ def _arms(strikes: Strikes) -> Arms:
     )  # fmt: skip
 
 
-def _only_row(strikes: Strikes, law: Law, mobility: Mobility) -> Array:
+def _only_row(strikes: Strikes, target: Array, most: Array, mobility: Mobility) -> Array:
     """Impulse of the only row of a world, (1, D, *batch) [N s]: a motor or the dry friction of one joint."""
     n, on = strikes.normal, strikes.active[:, None]
     per_impulse = jax.vmap(dot)(n, moved(n, _arms(strikes), mobility))
-    wanted = safe_divide(law.target - jax.vmap(dot)(n, strikes.v_rel), per_impulse)
-    return jnp.where(on, jnp.clip(wanted, -law.most, law.most)[:, None] * n, 0.0)
+    wanted = safe_divide(target - jax.vmap(dot)(n, strikes.v_rel), per_impulse)
+    return jnp.where(on, jnp.clip(wanted, -most, most)[:, None] * n, 0.0)
 
 
 def barely(strikes: Strikes, rest_speed: Array) -> Array:
