@@ -83,7 +83,7 @@ class Sampled(NamedTuple):
     q: np.ndarray  # (T+1, N + S, Q)
     v: np.ndarray  # (T+1, N + S, D)
     w: np.ndarray  # (T+1, N + S, A)
-    a: np.ndarray  # (T, N + S, D) [m/s^2] before an impact in the interval; 0 where the change may be that of a support
+    a: np.ndarray  # (T, N + S, D) [m/s^2] before an impact in the interval; 0 where a support or a joint may balance it
 
 
 def _numbers(vector: np.ndarray) -> str:
@@ -177,7 +177,8 @@ def _motion(trajectory: Trajectory, changes: Changes) -> Sampled:
         return np.concatenate([moving, np.broadcast_to(rest, (steps, count, moving.shape[2]))], axis=1)
 
     x, q = (joined(*both) for both in ((state.x, np.asarray(still.x, float)), (state.q, np.asarray(still.q, float))))
-    hit = np.linalg.norm(changes.p, axis=2) > SUPPORTED * changes.push
+    held = np.isin(np.arange(x.shape[1] - count), changes.joints.ends)
+    hit = (np.linalg.norm(changes.p, axis=2) > SUPPORTED * changes.push) & ~held
     a = np.concatenate([hit[..., None] * changes.fall, np.zeros((steps - 1, count, x.shape[2]))], axis=1)
     return Sampled(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0), a)
 

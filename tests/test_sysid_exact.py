@@ -297,7 +297,7 @@ def test_a_saved_fit_is_read_back_and_resumed(fit, records, tmp_path):
     assert {"diffrigid", "jax", "numpy"} <= set(json.loads((tmp_path / "fit.json").read_text())["versions"])
     again = dr.fit(*point(), records, free=FREE, progress=False, resume=saved, iterations=1)
     assert_allclose(again["p.x"].value, fit["p.x"].value, atol=1e-6)
-    with pytest.raises(ValueError, match="resume is a fit of .*p.x.*: expected one of some that are free here"):
+    with pytest.raises(ValueError, match="resume is a fit of .*p.x.*: expected one of some of what is free here"):
         dr.fit(*point(), records, free={"p.mass": dr.positive()}, progress=False, resume=saved)
     for use in (lambda fit: dr.profile(fit, "gravity"), dr.sample, sysid.jumps):
         with pytest.raises(ValueError, match=r"expected a Fit; what load_fit read is its table only: dr.fit\("):

@@ -106,7 +106,7 @@ def fit(
     problem = make_problem(world, state, observations, free=free, observe=observe, noise=noise, dt=dt, resume=resume)
     if resume is not None and not {p.name for p in resume.parameters} & {slot.name for slot in problem.slots}:
         theirs = ", ".join(p.name for p in resume.parameters)
-        raise ValueError(f"resume is a fit of {theirs}: expected one of some that are free here")
+        raise ValueError(f"resume is a fit of {theirs}: expected one of some of what is free here")
     stages = _stages((problem.width,) if widths is None else widths, (np.inf,) if windows is None else windows)
     if world.crowd and any(width > 0 for width, _ in stages):
         raise ValueError(f"widths is {widths!r}: expected (0.0,) for so many bodies; use fewer")
