@@ -79,7 +79,7 @@ def test_small_width_is_exact(kind):
         jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-6), narrow_jac[1], exact_jac[1])
 
 
-@pytest.mark.parametrize("kind", PASSES)
+@pytest.mark.parametrize("kind", ["discs", pytest.param("boxes", marks=pytest.mark.slow)])
 def test_near_miss_moves_the_target(kind):
     """The target moves, and aiming closer moves it more; at width 0 neither."""
     make, hit, miss = PASSES[kind]
@@ -220,6 +220,7 @@ TUMBLING = np.array(  # place of the second box, orientations, velocity of the s
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_boxes_whose_paths_sink_into_each_other_have_slopes():
     """Where the predicted paths come closest, other corners and crossings touch than before; their depth has no jumps."""
     box = dr.Box(half=(0.2, 0.15, 0.1))
