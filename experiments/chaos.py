@@ -3,10 +3,10 @@
     python experiments/chaos.py [--starts 8]
 
 Simulated: eight discs on a table with four cushions, one of them struck, positions at 60 Hz with 2 mm of noise for two
-seconds. Free: the restitution, and the velocity and position of the struck disc. At once: a fit of the whole record from
-random starts. Led in: with windows that grow, as `fit` does by default where residuals are left. In pieces (`fit_in_pieces`): the record cut into ten, each with states of its own that begin
-at what was measured, one restitution for all; then the whole record from what the first piece found, with a window that
-grows.
+seconds. Free: the restitution, and the velocity and position of the struck disc. At once: a fit of the whole record
+from random starts. Led in: with windows that grow, as `fit` does by default where residuals are left. In pieces
+(`fit_in_pieces`): the record cut into ten, each with states of its own that begin at what was measured, one restitution
+for all; then the whole record from what the first piece found, with a window that grows.
 
 Result (November 2026): 15 impacts. At once, the best of 8 starts ends at residuals of 6.1 times the noise and a
 restitution of 0.895. Led in, 8 of 8 starts agree, in 3 s after the first 28 s: the restitution is 0.92000 (0.91994 to

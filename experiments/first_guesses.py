@@ -3,7 +3,7 @@
     python experiments/first_guesses.py [--guesses 150]
 
 Two simulated records, each fitted from many single starts: three discs that strike each other twice (60 Hz, 3 mm of
-noise; restitution, a mass and a velocity free), from guesses of which a third strike nothing or the wrong side; and a
+noise; restitution, a mass and a velocity free), from guesses whose velocity, 2 m/s in truth, is off by 1.5 m/s; and a
 box that tumbles onto a floor and strikes it with two corners (120 Hz, 1 mm and 0.01 rad of noise; nine numbers free),
 from guesses of which the spin is off by 3 rad/s and the inertia by 40 %, so that other corners strike. Counted is how
 often the restitution and the mass, or the friction, are those of the truth: with the whole record at once, and as `fit`

@@ -23,7 +23,8 @@ from diffrigid.sysid.free import Each, Free, Prior
 from diffrigid.sysid.sensors import Channel, is_turn
 from diffrigid.world import World
 
-UNIT = {"normal": "direction", "axis_a": "direction", "axis_b": "direction", "q": "rotation", "zero": "rotation"}
+# Fields of length one, and the kind that keeps it.
+CONDITIONED = {"normal": "direction", "axis_a": "direction", "axis_b": "direction", "q": "rotation", "zero": "rotation"}
 
 
 class Scene(NamedTuple):
@@ -185,18 +186,23 @@ def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unli
         raise ValueError(f"free[{key!r}]: paths of shapes {sorted(shapes)}, expected {expected}")
     shape = reference(slot, having[0]).shape
     size = kind.size(shape)
-    field = component(names[0])[0].rpartition(".")[2]
-    if isinstance(kind, Chart) and kind.name == "rotation" and UNIT.get(field) != "rotation":
-        raise ValueError(f"free[{key!r}]: rotation() is for orientations, such as 'die.q'")
-    if isinstance(kind, Free) and field in UNIT:
-        raise ValueError(f"free[{key!r}]: expected {UNIT[field]}(), which keeps its length")
-    if isinstance(kind, Free) and component(names[0])[0].endswith(".inertia") and having[0].world.dim == 3:
-        raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
+    _refuse_kind(key, kind, component(names[0])[0].rpartition(".")[2], having[0].world.dim)
     for scene in having:
         kind.check(f"free[{key!r}]", np.asarray(reference(slot, scene)))
     if prior is not None and len(prior.mean) not in (1, int(np.prod(shape))):
         raise ValueError(f"free[{key!r}]: a prior with {len(prior.mean)} means, expected those of the shape {shape}")
     return replace(slot, size=size)
+
+
+def _refuse_kind(key: Any, kind: Free | Chart, field: str, dim: int) -> None:
+    """Raise ValueError for a kind that does not keep the condition on such a field, or is of another."""
+    if isinstance(kind, Chart):
+        if kind.name == "rotation" and CONDITIONED.get(field) != "rotation":
+            raise ValueError(f"free[{key!r}]: rotation() is for orientations, such as 'die.q'")
+    elif field in CONDITIONED:
+        raise ValueError(f"free[{key!r}]: expected {CONDITIONED[field]}(), which keeps its length")
+    elif field == "inertia" and dim == 3:
+        raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
 
 
 def _refuse_ambiguous(names: tuple[str, ...], scenes: Sequence[Scene]) -> None:

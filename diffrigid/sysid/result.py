@@ -201,20 +201,20 @@ class Fit:
         """Warn if a score is poor where records began at the state of the first record of the fit, perhaps too late."""
         ratios = {name: size / self.noise.get(name, np.inf) for name, size in sizes.items()}
         worst = max(ratios, key=lambda name: ratios[name])
-        if borrowed and ratios[worst] > POOR:
-            warnings.warn(
-                f"score: residuals of {worst} are {ratios[worst]:.2g} times the noise of the fit, but record "
-                f"{borrowed[0]} began at the fitted state of record 0 of the fit, as its first rows do not show one: "
-                "give it a first guess, dr.Record(..., state=first), or more starts",
-                stacklevel=3,
+        if not (borrowed or late) or ratios[worst] <= POOR:
+            return
+        if borrowed:
+            how = (
+                f"record {borrowed[0]} began at the fitted state of record 0 of the fit, as its first rows do not show "
+                "one: give it a first guess, dr.Record(..., state=first), or more starts"
             )
-        elif late and ratios[worst] > POOR:
-            warnings.warn(
-                f"score: residuals of {worst} are {ratios[worst]:.2g} times the noise of the fit: record {late[0]} "
-                "began at the fitted start, at its first row; if that is later, give dr.Record(..., start=0.0), with "
-                "the time of the start",
-                stacklevel=3,
+        else:
+            how = (
+                f"record {late[0]} began at the fitted start, at its first row; if that is later, give "
+                "dr.Record(..., start=0.0), with the time of the start"
             )
+        size = f"{ratios[worst]:.2g} times the noise of the fit"
+        warnings.warn(f"score: residuals of {worst} are {size}, but {how}", stacklevel=3)
 
     def derived(self, fn: Callable[[World, State], Any], record: int = 0) -> Parameter:
         """A number, or an array, that follows from the fitted scene of a record, with its 95 % interval.
