@@ -1,7 +1,7 @@
 """Errors of the joints of a world, and their rates as its bodies move.
 
-J is the Jacobian of all errors with respect to the twists (dx, dtheta) of the bodies. J u, the rate of J v and J^T lam
-are derivatives of the error function of a joint, in forward mode and by transposition; smooth wherever that is.
+J is the Jacobian of all errors with respect to the twists (dx, dtheta) of the bodies. It and the rate of J v are
+derivatives of the error function of a joint, in forward mode; smooth wherever that is.
 """
 
 import functools
@@ -111,25 +111,3 @@ def joint_jacobian(so: ModuleType, groups: tuple[PlacedJoints, ...]) -> Array:
     """J in blocks, one for each of the two bodies of each joint, (n, E, 2, D + A, *batch)."""
     flat = of_each(lambda joint, a, b: by_twists(so, _held(so, joint), a, b), groups)
     return flat.reshape(*flat.shape[:2], 2, so.D + so.A, *flat.shape[3:])
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def joint_forces(so: ModuleType, sides: Array, groups: tuple[PlacedJoints, ...], lam: Array) -> Array:
-    """J^T lam on the two bodies of each joint, (n, 2, D + A, *batch), for multipliers (n, E, *batch).
-
-    Args:
-        sides: J as `joint_jacobian` has it. Not differentiated: the derivative of J^T lam is that of the transpose of
-            J u, which takes a fraction of the derivative of all columns of J.
-    """
-    del so, groups
-    return functools.reduce(jnp.add, (sides[:, e] * lam[:, e, None, None] for e in range(lam.shape[1])))
-
-
-@joint_forces.defjvp
-def _forces_jvp(so, primals, tangents):
-    def transposed(groups, lam):
-        like = jax.eval_shape(functools.partial(joint_forces, so), *primals)
-        back = jax.linear_transpose(functools.partial(joint_rates, so, groups), like)
-        return back(lam)[0]
-
-    return joint_forces(so, *primals), jax.jvp(transposed, primals[1:], tangents[1:])[1]

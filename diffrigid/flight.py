@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid import so3
+from diffrigid.fence import at_hand
 from diffrigid.forces import is_constant, total_wrench, within
 from diffrigid.linkage import joint_wrench
 from diffrigid.numerics import safe_divide
@@ -71,7 +72,8 @@ def launch(world: "World", state: State, controls: Any, t0: Array, t1: Array) ->
     )  # fmt: skip
     if not varies:
         return flight
-    return _along(flight, *_runge_kutta(world, flight, controls, t1[None] - t0), t1[None] - t0, has_torque(world))
+    span = t1[None] - t0
+    return at_hand(_along(flight, *_runge_kutta(world, flight, controls, span), span, has_torque(world)))
 
 
 def _wrench(world: "World", state: State, controls: Any, span: Array) -> Wrench:
@@ -114,7 +116,7 @@ def _runge_kutta(world: "World", f: Flight, controls: Any, T: Array) -> tuple[Mo
         )
 
     def rates(motion):
-        state = placed(motion)
+        state = at_hand(placed(motion))
         wrench = _wrench(world, state, controls, T.max(0))
         tau = jnp.zeros_like(motion.L) if wrench.tau is None else wrench.tau
         return Motion(x=motion.v, phi=turning(motion, state), v=f.inverse_mass[:, None] * wrench.F, L=tau)

@@ -24,9 +24,7 @@ from diffrigid.constraints import (
     by_twists,
     joint_accelerations,
     joint_errors,
-    joint_forces,
     joint_jacobian,
-    joint_rates,
     of_each,
     placed,
 )
@@ -51,7 +49,7 @@ class Linkage:
     """How the n joints of a world act on its N moving bodies."""
 
     groups: tuple[PlacedJoints, ...] = ()
-    sides: Array = array("n", "E", "2", "D + A")  # J, without derivative
+    sides: Array = array("n", "E", "2", "D + A")  # J
     factors: tuple[Factor, ...] = ()  # of J M^-1 J^T, without derivative
     inverse_mass: Array = array("N")  # [1/kg]
     inverse_inertia: Any = None  # [1/(kg m^2)] world axes
@@ -62,10 +60,10 @@ def linkage(joints: tuple, statics: Any, bodies: Bodies, x: Array, q: Array) -> 
     """Linkage of the joints of a world at poses x (N, D, *batch), q (N, Q, *batch)."""
     so, ends = rotations(bodies.dim), ends_of(joints)
     groups = placed(joints, statics, x, q)
-    inverse = jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q)
+    inverse = at_hand(jax.vmap(so.world_inverse)(jax.vmap(so.inverse_inertia)(bodies.inertia), q))
     inverse_mass = 1.0 / bodies.mass
-    sides = unfused(functools.partial(joint_jacobian, so), lax.stop_gradient(groups))
-    blocks = _blocks(so, ends, sides, *lax.stop_gradient((inverse_mass, inverse)))
+    sides = unfused(functools.partial(joint_jacobian, so), groups)
+    blocks = _blocks(so, ends, *lax.stop_gradient((sides, inverse_mass, inverse)))
     return Linkage(
         groups=groups, sides=sides, factors=factorise(plan_of(ends, len(x)), blocks), inverse_mass=inverse_mass,
         inverse_inertia=inverse, ends=ends,
@@ -120,14 +118,12 @@ def _sides_of(ends: tuple[tuple[int, int], ...], moving: int) -> tuple[tuple[int
 
 def _rates(link: Linkage, twists: Array) -> Array:
     """J u for the twists u of all bodies (N, D + A, *batch), (n, E, *batch)."""
-    so = rotations(link.groups[0].a.x.shape[1])
-    return joint_rates(so, link.groups, to_sides(link.ends, twists))
+    return (link.sides * to_sides(link.ends, twists)[:, None]).sum((2, 3))
 
 
 def _pull(link: Linkage, lam: Array) -> Array:
     """J^T lam on all bodies, (N, D + A, *batch)."""
-    so = rotations(link.groups[0].a.x.shape[1])
-    return by_body(link.ends, len(link.inverse_mass), joint_forces(so, link.sides, link.groups, lam))
+    return by_body(link.ends, len(link.inverse_mass), (link.sides * lam[:, :, None, None]).sum(1))
 
 
 def _moved(link: Linkage, forces: Array) -> Array:
@@ -159,7 +155,6 @@ def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
 
 def joint_wrench(joints: tuple, statics: Any, bodies: Bodies, state: State, wrench: Wrench, span: Array) -> Wrench:
     """Forces of a world, with the constraint forces of its joints, for an integration over span (*batch) [s]."""
-    state = at_hand(state)
     so, link = rotations(bodies.dim), linkage(joints, statics, bodies, state.x, state.q)
     torque = jnp.zeros_like(state.w) if wrench.tau is None else wrench.tau
     given = _damped(joints, link, twists_of(state), jnp.concatenate([wrench.F, torque], axis=1), span)

@@ -21,6 +21,7 @@ from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
 from diffrigid.contact.sums import at_colliders, side_sum
 from diffrigid.elimination import islands
+from diffrigid.fence import at_hand
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import flags
 from diffrigid.linkage import Linkage, ends_of, linkage, spread
@@ -197,8 +198,8 @@ def _posed(world: "World", flight: Flight, t: Array, ago: Array) -> tuple[Array,
     so = rotations(flight.dim)
 
     def linked(t: Array) -> tuple[Array, Linkage]:
-        q = jax.vmap(orientation)(flight, t)
-        return q, linkage(world.joints, world.statics, world.bodies, jax.vmap(position)(flight, t), q)
+        x, q = at_hand((jax.vmap(position)(flight, t), jax.vmap(orientation)(flight, t)))
+        return q, linkage(world.joints, world.statics, world.bodies, x, q)
 
     if world.joints:
         q, link = linked(t)

@@ -45,8 +45,10 @@ from diffrigid.contact.strikes import (
 )
 from diffrigid.contact.sums import at_colliders
 from diffrigid.contact.supported import find_supported, matters
+from diffrigid.elimination import islands
 from diffrigid.flight import Flight, state_at
 from diffrigid.gathers import flags
+from diffrigid.linkage import ends_of
 from diffrigid.numerics import FOUND, PASSED, dot, recomputed, safe_divide, saving, with_tangents
 from diffrigid.pytree import Leaf, array, pytree, replace, static
 from diffrigid.state import State
@@ -112,7 +114,7 @@ class Contact:
             others, none = map(jax.checkpoint, (lambda *of: end(passes(*of)), lambda start, _: end(start)))
             return lax.cond(done < self.sweeps, others, none, start, done)
         if all(driven(world)):
-            return end(passes(start))
+            return passes(start).state if ends_all(world) else end(passes(start))
         near = may_meet(world, launch(state, t0), dt)
         return end(lax.cond(near, passes, lambda start: start, start))
 
@@ -159,6 +161,13 @@ class Contact:
 def _rows(world: "World") -> int:
     """Number of rows: contacts, rolling rows, and rows of joints. Static."""
     return len(driven(world)) + is_rolling(world) * contact_count(world)
+
+
+def ends_all(world: "World") -> bool:
+    """Whether HOLD leaves all bodies at the end of the step, as each is joined to one with a motor or friction. Static."""
+    always, of = driven(world), ends(world)
+    held = {end for side in "ab" for end, acts in zip(of[side], always, strict=True) if acts}
+    return all(not held.isdisjoint(bodies) for bodies in islands(ends_of(world.joints), len(world.names)))
 
 
 class Progress(NamedTuple):

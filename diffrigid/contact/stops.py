@@ -19,6 +19,7 @@ from diffrigid.contact.approach import rounding, touches
 from diffrigid.contact.gaps import NEAR
 from diffrigid.contact.order import Meeting
 from diffrigid.contact.resting import Strikes
+from diffrigid.fence import at_hand
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import rows
 from diffrigid.joints import Pose
@@ -176,12 +177,12 @@ def _near(joint: Any, a: Flight, b: Flight, s: Array) -> Array:
 
 def _row(kind: str, dt: Array, joint: Any, a: Flight, b: Flight, meeting: Meeting) -> Strikes:
     so, sign, s = rotations(a.dim), -1.0 if kind == "upper" else 1.0, meeting.s
-    poses: Any = [Pose(position(f, s), orientation(f, s)) for f in (a, b)]
+    poses: Any = at_hand([Pose(position(f, s), orientation(f, s)) for f in (a, b)])
     inverses = [so.world_inverse(f.inverse_inertia, pose.q) for f, pose in zip((a, b), poses, strict=True)]
     spins = [so.apply(i, angular_momentum(f, s)) for i, f in zip(inverses, (a, b), strict=True)]
     twists = [jnp.concatenate([velocity(f, s), w]) for f, w in zip((a, b), spins, strict=True)]
     middle = s - 0.5 * jnp.where(meeting.held, s - jnp.maximum(a.t0, b.t0), 0.0)
-    then: Any = [Pose(position(f, middle), orientation(f, middle)) for f in (a, b)]
+    then: Any = at_hand([Pose(position(f, middle), orientation(f, middle)) for f in (a, b)])
     both = jax.tree.map(lambda *two: jnp.stack(two), poses, then)
     along = jax.vmap(lambda a, b: by_twists(so, lambda a, b: joint.coordinate(so, a, b)[None], a, b)[0])(*both)
     jac, mid_jac = sign * along.reshape(2, 2, so.D + so.A, *s.shape)
