@@ -37,19 +37,26 @@ def test_rows_are_those_of_a_matrix(case):
     def expected(values):
         return jnp.tensordot(picks, values, 1)
 
-    def cube(of):
-        return lambda values: (of(values) ** 3).sum()
-
     def picked(values):
         return pick(values, index)
 
+    def cube(of):
+        return lambda values: (of(values) ** 3).sum()
+
+    def in_all_ways(of):
+        def ways(values):
+            slope = jax.grad(cube(of))
+            yield of(values)
+            yield jax.jvp(of, (values,), (values**2,))[1]
+            yield slope(values)
+            yield jax.hessian(cube(of))(values)
+            for axis in range(values.ndim + 1):
+                many = jnp.stack([values, 2.0 * values], axis)
+                yield from (jax.vmap(way, axis)(many) for way in (of, slope))
+
+        return jax.jit(lambda values: tuple(ways(values)))
+
     values = jnp.asarray(VALUES)
-    assert_allclose(picked(values), expected(values), atol=1e-15)
-    assert_allclose(jax.jvp(picked, (values,), (values**2,))[1], expected(values**2), atol=1e-15)
-    assert_allclose(jax.grad(cube(picked))(values), jax.grad(cube(expected))(values), atol=1e-14)
-    assert_allclose(jax.hessian(cube(picked))(values), jax.hessian(cube(expected))(values), atol=1e-13)
-    for axis in range(values.ndim + 1):
-        many = jnp.stack([values, 2.0 * values], axis)
-        for way in (lambda of: of, lambda of: jax.grad(cube(of))):
-            assert_allclose(jax.vmap(way(picked), axis)(many), jax.vmap(way(expected), axis)(many), atol=1e-13)
+    for got, exact in zip(in_all_ways(picked)(values), in_all_ways(expected)(values), strict=True):
+        assert_allclose(got, exact, rtol=1e-13, atol=1e-13)
     assert "scatter" not in str(jax.make_jaxpr(jax.grad(cube(picked)))(values))

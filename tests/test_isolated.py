@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_form import with_slopes
 from numpy.testing import assert_allclose
 
 import diffrigid as dr
@@ -116,9 +117,9 @@ def test_a_disc_falls_on_a_disc_that_stands_still():
         duration = jnp.sqrt(2 * drop / 9.81) * (1 + e)
         return dr.rollout(world, state, dt=1 / 60, times=jnp.stack([0.0, duration]), substeps=(30,)).state.x[-1, 0, 1]
 
-    value, slopes = jax.value_and_grad(height, argnums=(0, 1))(0.8, 0.5, 0.0)
+    value, slopes = with_slopes(height)(0.8, 0.5, 0.0)
     assert_allclose(value, 0.3 + 0.64 * 0.5, rtol=1e-12)
-    assert_allclose(slopes, (2 * 0.8 * 0.5, 0.64), rtol=1e-9)
+    assert_allclose(slopes[:2], (2 * 0.8 * 0.5, 0.64), rtol=1e-9)
 
 
 def test_more_discs_than_sweeps_strike_one_floor_in_a_step():

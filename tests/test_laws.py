@@ -85,7 +85,7 @@ def crowds(dim):
     return jax.jit(lambda p: jax.lax.map(one, p))(starts(dim))
 
 
-@pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
+@some_later("dim", [2, 3], 3)
 def test_crowds_meet(dim):
     """The tests below say something: in nearly every world bodies collide, and lose energy where they may."""
     states, _, _, energy = crowds(dim)
@@ -105,33 +105,33 @@ def test_a_frame_that_moves_sees_the_same(dim):
         assert_allclose(getattr(moved, name), np.asarray(getattr(home, name)) + more, atol=GROWN, err_msg=name)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@some_later("dim", [2, 3], 3)
 def test_momentum_is_kept(dim):
     _, momentum, _, _ = crowds(dim)
     assert_allclose(momentum, np.broadcast_to(momentum[:, :1], momentum.shape), atol=10 * ROUNDING)  # [kg m/s], about 1
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@some_later("dim", [2, 3], 3)
 def test_angular_momentum_is_kept_in_elastic_collisions(dim):
     _, _, L, _ = crowds(dim)
     L = L[:ELASTIC]
     assert_allclose(L, np.broadcast_to(L[:, :1], L.shape), atol=10 * ROUNDING)  # [kg m^2/s], about 1
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@some_later("dim", [2, 3], 3)
 def test_angular_momentum_is_kept_where_bodies_may_stay_together(dim):
     _, _, L, _ = crowds(dim)
     L = L[ELASTIC:WORLDS]
     assert_allclose(L, np.broadcast_to(L[:, :1], L.shape), atol=10 * ROUNDING)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@some_later("dim", [2, 3], 3)
 def test_energy_is_kept_by_elastic_collisions_without_friction(dim):
     energy = crowds(dim)[3][:SMOOTH]
     assert_allclose(energy / energy[:, :1], 1.0, atol=ROUNDING if dim == 2 else SPIN_SERIES)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@some_later("dim", [2, 3], 3)
 def test_energy_never_rises(dim):
     """Friction and e = 1 included, where Newton's law with Coulomb friction could make energy (Kane's paradox)."""
     energy = crowds(dim)[3]
@@ -191,7 +191,7 @@ def test_what_is_round_and_smooth_strikes_as_if_it_did_not_spin(kind):
     assert_allclose(ends[2, :2, 1], rebound[:2], atol=ROUNDING)  # the third comes down again
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@some_later("dim", [2, 3], 3)
 def test_swapping_bodies_swaps_their_motions(dim):
     """Each pair then has its sides a and b exchanged."""
     states = crowds(dim)[0]

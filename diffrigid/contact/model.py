@@ -164,7 +164,7 @@ def _rows(world: "World") -> int:
 
 
 def ends_all(world: "World") -> bool:
-    """Whether HOLD leaves all bodies at the end of the step, as each is joined to one with a motor or friction. Static."""
+    """Whether HOLD leaves all bodies at the end: each is joined to one with a motor or joint friction. Static."""
     always, of = driven(world), ends(world)
     held = {end for side in "ab" for end, acts in zip(of[side], always, strict=True) if acts}
     return all(not held.isdisjoint(bodies) for bodies in islands(ends_of(world.joints), len(world.names)))
