@@ -20,6 +20,9 @@ shape = { half_space = { normal = [0.0, 1.0] } }
 [forces]
 air = { drag = { linear = 0.1 } }
 
+[values]                                    # other numbers of the scene, by their paths
+"ball.w" = 2.0
+
 [free]                                      # what `fit` may vary
 restitution = { interval = [0, 1] }
 "ball.v" = { each = "real" }                # a launch of its own for every file of data
@@ -40,6 +43,14 @@ t = { time = 0.001 }                        # "time" in ms
 starts = 8
 loss = "huber"
 noise = { "ball.x" = 0.001 }
+
+A robot is read from its own file, beside this one; it has the bodies, joints and gravity, so [values], [free],
+[observe], [columns], [fit] and contact are left for here:
+
+robot = { urdf = { path = "arm.urdf", friction = 0.3 } }    # arguments of `load_urdf`; or mjcf = { path = "arm.xml" }
+
+[values]
+"elbow.angle" = 0.9
 """
 
 import inspect
@@ -50,9 +61,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from diffrigid import forces, joints, shapes, sysid
+from diffrigid import forces, joints, paths, shapes, sysid
 from diffrigid.contact import Contact
-from diffrigid.convert import nearest
+from diffrigid.convert import nearest, numbers
+from diffrigid.models import load_mjcf, load_urdf
 from diffrigid.parts import Part
 from diffrigid.scene import Body, Static, scene
 from diffrigid.state import COEFFICIENTS, State
@@ -64,7 +76,7 @@ def _words(kind: type) -> str:
     return re.sub("(?<=.)([A-Z])", r"_\1", kind.__name__).lower()
 
 
-TABLES = ("bodies", "statics", "forces", "joints", "free", "observe", "columns", "fit")
+TABLES = ("bodies", "statics", "forces", "joints", "robot", "values", "free", "observe", "columns", "fit")
 ARGUMENTS = ("gravity", *COEFFICIENTS, "ignore", "contact")
 OPTIONS = ("starts", "dt", "noise", "widths", "windows", "iterations", "seed", "loss")
 KINDS: dict[str, Callable] = {
@@ -74,6 +86,7 @@ KINDS: dict[str, Callable] = {
 SHAPES = {_words(kind): kind for kind in shapes.SHAPES}
 FORCES = {_words(kind): kind for kind in forces.FORCES if kind is not forces.Gravity}
 FORCES["spring"] = FORCES.pop("spring_damper")
+ROBOTS: dict[str, Callable] = {"urdf": load_urdf, "mjcf": load_mjcf}
 JOINTS = {_words(kind): kind for kind in joints.JOINTS}
 OBSERVERS: dict[str, Callable] = {
     _words(kind): kind for kind in (sysid.Marker, sysid.Separation, sysid.Homography, sysid.Pinhole)
@@ -110,17 +123,11 @@ def read_scene(path: str | Path) -> SceneFile:
     for key in TABLES:
         if not isinstance(data.get(key, {}), Mapping):
             raise ValueError(f"{path}: {key} is {data[key]!r}: expected a table")
-    bodies = {name: _body(f"{path}: bodies.{name}", Body, entry) for name, entry in data.get("bodies", {}).items()}
-    statics = {name: _body(f"{path}: statics.{name}", Static, entry) for name, entry in data.get("statics", {}).items()}
-    arguments = {key: data[key] for key in ARGUMENTS if key in data}
-    if "contact" in arguments:
-        arguments["contact"] = _made(f"{path}: contact", Contact, arguments["contact"])
-    world, state = scene(
-        {**bodies, **statics},
-        forces={k: _one_of(f"{path}: forces.{k}", FORCES, entry) for k, entry in data.get("forces", {}).items()},
-        joints={k: _one_of(f"{path}: joints.{k}", JOINTS, entry) for k, entry in data.get("joints", {}).items()},
-        **arguments,
-    )
+    if "contact" in data:
+        data["contact"] = _made(f"{path}: contact", Contact, data["contact"])
+    world, state = (_robot if "robot" in data else _scene)(path, data)
+    for key, value in data.get("values", {}).items():
+        world, state = _with(f"{path}: values.{key}", world, state, key, value)
     return SceneFile(
         world=world,
         state=state,
@@ -132,6 +139,36 @@ def read_scene(path: str | Path) -> SceneFile:
         columns={k: _column(f"{path}: columns.{k}", entry) for k, entry in data.get("columns", {}).items()},
         options=_options(f"{path}: fit", data.get("fit", {})),
     )
+
+
+def _scene(path: str | Path, data: Mapping[str, Any]) -> tuple[World, State]:
+    bodies = {name: _body(f"{path}: bodies.{name}", Body, entry) for name, entry in data.get("bodies", {}).items()}
+    statics = {name: _body(f"{path}: statics.{name}", Static, entry) for name, entry in data.get("statics", {}).items()}
+    return scene(
+        {**bodies, **statics},
+        forces={k: _one_of(f"{path}: forces.{k}", FORCES, entry) for k, entry in data.get("forces", {}).items()},
+        joints={k: _one_of(f"{path}: joints.{k}", JOINTS, entry) for k, entry in data.get("joints", {}).items()},
+        **{key: data[key] for key in ARGUMENTS if key in data},
+    )
+
+
+def _robot(path: str | Path, data: Mapping[str, Any]) -> tuple[World, State]:
+    for key in ("bodies", "statics", "forces", "joints", *ARGUMENTS):
+        if key in data and key != "contact":
+            raise ValueError(f"{path}: {key} beside robot: the file of the robot says what there is")
+    contact = {"contact": data["contact"]} if "contact" in data else {}
+    entry = data["robot"]
+    if len(entry) == 1 and isinstance(fields := next(iter(entry.values())), Mapping) and "path" in fields:
+        entry = {next(iter(entry)): {**fields, **contact, "path": Path(path).parent / str(fields["path"])}}
+    return _one_of(f"{path}: robot", ROBOTS, entry)
+
+
+def _with(where: str, world: World, state: State, key: str, value: Any) -> tuple[World, State]:
+    """World and state with another value of a parameter."""
+    try:
+        return paths.write(world, state, key, numbers(key, value, None))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def _column(where: str, entry: Any) -> tuple[str, float]:

@@ -110,6 +110,52 @@ def test_mistakes_in_scene_files(tmp_path, change, message):
         read_scene(file)
 
 
+ROD = """<robot name="r"><link name="base"/><link name="rod"><inertial><mass value="2"/><origin xyz="0 0 -0.5"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint></robot>"""
+SWINGS = """
+robot = { urdf = { path = "rod.urdf", gravity = [0.0, 0.0, -9.8] } }
+contact = { width = 0.01 }
+
+[values]
+"hinge.angle" = 0.9
+"rod.mass" = 3.0
+
+[free]
+"hinge.rate" = "real"
+"""
+
+
+def test_a_scene_file_may_name_the_file_of_a_robot(tmp_path):
+    (tmp_path / "rod.urdf").write_text(ROD)
+    (tmp_path / "scene.toml").write_text(SWINGS)
+    found = read_scene(tmp_path / "scene.toml")
+    made = dr.load_urdf(tmp_path / "rod.urdf", gravity=(0.0, 0.0, -9.8), contact=dr.Contact(width=0.01))
+    made = dr.paths.write(*dr.paths.write(*made, "hinge.angle", 0.9), "rod.mass", 3.0)
+    assert jax.tree.structure((found.world, found.state)) == jax.tree.structure(made)
+    jax.tree.map(assert_allclose, (found.world, found.state), made)
+    assert found.free == {"hinge.rate": dr.real()}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("contact =", "friction ="), "friction beside robot"),
+        (("urdf =", "udrf ="), "robot: no 'udrf': did you mean 'urdf'"),
+        (("gravity =", "gravitation ="), "robot: no field 'gravitation': did you mean 'gravity'"),
+        (("{ urdf = {", "3 #"), "robot is 3: expected a table"),
+        (('path = "rod.urdf", ', ""), "robot: .*path"),
+        (("hinge.angle", "hinge.angel"), "values.hinge.angel: .*did you mean 'hinge.angle'"),
+        (("= 0.9", '= "right"'), "values.hinge.angle: .*expected numbers"),
+    ],
+)
+def test_mistakes_in_scene_files_of_robots(tmp_path, change, message):
+    (tmp_path / "rod.urdf").write_text(ROD)
+    (tmp_path / "scene.toml").write_text(SWINGS.replace(*change, 1))
+    with pytest.raises(ValueError, match=message):
+        read_scene(tmp_path / "scene.toml")
+
+
 def test_fit_from_the_command_line(tmp_path):
     """A fall: x = v t, y = 1 - g t^2 / 2."""
     (tmp_path / "scene.toml").write_text(
