@@ -24,7 +24,9 @@ from diffrigid.trajectory import Trajectory
 from diffrigid.world import World, check, check_kinds, check_leaves, shape_of_leaf
 
 MUCH = 100_000_000  # [-] of `work`: beyond it a longer compilation pays
-A_BODY = 100  # work for a body or a joint, in numbers found by contacts
+# Work, in numbers that contacts in the plane find: of a body, a joint in the plane, one in space, and of a number that
+# contacts in space find. Measured, and weighted by how much longer such programs take to compile for speed.
+A_BODY, A_JOINT, A_JOINT_IN_SPACE, IN_SPACE = 100, 2_000, 20_000, 12
 CALLS = 3000  # expected number of calls of `step`
 
 
@@ -248,5 +250,7 @@ def _worlds(state: State) -> int:
 
 
 def work(world: World) -> int:
-    """Estimate of the work of a step, in numbers found by its contacts."""
-    return world.contact.saved_numbers(world) + A_BODY * (len(world.names) + sum(map(len, world.joint_names)))
+    """Estimate of the work of a step, in numbers found by contacts in the plane."""
+    found, joints = world.contact.saved_numbers(world), sum(map(len, world.joint_names))
+    of_a_number, of_a_joint = (1, A_JOINT) if world.dim == 2 else (IN_SPACE, A_JOINT_IN_SPACE)
+    return of_a_number * found + A_BODY * len(world.names) + of_a_joint * joints

@@ -67,6 +67,17 @@ def test_a_motor_reaches_its_speed_and_dry_friction_stops_it(mode):
     )
 
 
+def test_a_wheel_without_a_motor_turns_on_beside_one_that_is_braked():
+    """A motor or friction holds its body to the end of a step; what is joined to none flies there. Slopes by time too."""
+    scene = wheels({"braked": (1.7, {"friction": 0.473}), "free": (0.9, {})}, 2)
+
+    def angles(time):
+        end = dr.rollout(*scene, dt=1.0, times=jnp.stack([0.0 * time, time]), substeps=(30,)).state.q[-1]
+        return jnp.arctan2(end[:, 1], end[:, 0])
+
+    check_with_slopes(angles, lambda t: jnp.stack([1.7 * t - 0.5 * 0.473 / INERTIA * t**2, 0.9 * t]), (0.7,))
+
+
 @pytest.mark.slow
 def test_a_limit_of_a_joint_that_does_not_rub_is_struck_at_its_time():
     check_with_slopes(
