@@ -26,6 +26,7 @@ air = { drag = { linear = 0.1 } }
 [free]                                      # what `fit` may vary
 restitution = { interval = [0, 1] }
 "ball.v" = { each = "real" }                # a launch of its own for every file of data
+"ball.inertia" = { inertia = { principal = true } }    # arguments by name; or one, or a list of them, in order
 "ball.mass" = { prior = ["positive", 1.0, 0.1] }
 "a.mass = b.mass" = "positive"              # one value for both
 "a.mass : b.mass" = "shares"                # their ratio
@@ -259,6 +260,8 @@ def _named(where: str, kinds: Mapping[str, Callable], entry: Any) -> Any:
     if name not in kinds:
         raise ValueError(f"{where} is {name!r}: {nearest(name, kinds)}")
     try:
+        if isinstance(arguments, Mapping):
+            return kinds[name](**arguments)
         return kinds[name](*(arguments if isinstance(arguments, list) else [arguments]))
     except TypeError as error:
         raise ValueError(f"{where}: {error}") from None

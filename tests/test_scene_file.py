@@ -123,6 +123,7 @@ contact = { width = 0.01 }
 
 [free]
 "hinge.rate" = "real"
+"rod.inertia" = { inertia = { principal = true } }
 """
 
 
@@ -134,7 +135,7 @@ def test_a_scene_file_may_name_the_file_of_a_robot(tmp_path):
     made = dr.paths.write(*dr.paths.write(*made, "hinge.angle", 0.9), "rod.mass", 3.0)
     assert jax.tree.structure((found.world, found.state)) == jax.tree.structure(made)
     jax.tree.map(assert_allclose, (found.world, found.state), made)
-    assert found.free == {"hinge.rate": dr.real()}
+    assert found.free == {"hinge.rate": dr.real(), "rod.inertia": dr.inertia(principal=True)}
 
 
 @pytest.mark.parametrize(
@@ -145,6 +146,7 @@ def test_a_scene_file_may_name_the_file_of_a_robot(tmp_path):
         (("gravity =", "gravitation ="), "robot: no field 'gravitation': did you mean 'gravity'"),
         (("{ urdf = {", "3 #"), "robot is 3: expected a table"),
         (('path = "rod.urdf", ', ""), "robot: .*path"),
+        (("principal =", "principle ="), "free.rod.inertia: .*principle"),
         (("hinge.angle", "hinge.angel"), "values.hinge.angel: .*did you mean 'hinge.angle'"),
         (("= 0.9", '= "right"'), "values.hinge.angle: .*expected numbers"),
     ],
