@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -15,7 +16,7 @@ from scipy.special import stdtrit
 
 import diffrigid as dr
 from diffrigid import sysid
-from diffrigid.sysid.covariance import own_covariance
+from diffrigid.sysid.covariance import Linear, from_jacobian, own_covariance
 from diffrigid.sysid.levenberg import Numbers, point_at
 from diffrigid.sysid.profile import ProfileLikelihood
 from diffrigid.sysid.remarks import beside_a_jump, failed
@@ -645,3 +646,14 @@ def test_records_of_one_shape_share_what_is_compiled():
     data["p.x[0]"][3] = np.nan
     dr.fit(*spring(3.5), data, free={"spring.stiffness": dr.positive()}, progress=False)
     assert programs() == before
+
+
+def test_what_has_no_effect_but_rounding_widens_no_interval():
+    """Two columns that are the same but for 1e-6, and one of rounding: the numbers beside them keep their variances."""
+    rng = np.random.default_rng(0)
+    J, noise = rng.normal(size=(50, 3)), rng.normal(size=(50, 3))
+    blind = np.stack([J[:, 2] + 1e-6 * noise[:, 0], 1e-14 * noise[:, 1]], axis=1)
+    linear = Linear((noise[:, 2],), (np.concatenate([J, blind], axis=1),), (np.arange(50.0),), 5, 1.0, False)
+    for intervals in (from_jacobian, dr.sandwich, dr.bootstrap):
+        alone = intervals(replace(linear, slopes=(J,), shared=3)).covariance
+        assert_allclose(intervals(linear).covariance[:2, :2], alone[:2, :2], rtol=1e-4, atol=1e-5)

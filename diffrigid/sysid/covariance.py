@@ -15,7 +15,10 @@ LITTLE_INFORMATION = 0.01  # [-] of that in a direction: if all clusters but one
 DRAWS = 2000  # of the bootstrap
 LEAST_FREE = 0.05  # [-] least share of degrees of freedom that is taken to be left
 NORMAL_FREEDOM = 1e6  # degrees of freedom for which Student's distribution is the normal one
-NO_INFORMATION = 1e-13  # [-] of the largest eigenvalue of a scaled information: smaller ones are rounding
+SAME_EFFECT = (
+    1e-8  # [-] eigenvalue of the scaled information below which effects are the same: a correlation of 1 - 1e-8
+)
+ROUNDING = 1e-12  # [-] of the largest effect: a smaller one counts as none
 NO_EFFECT = 1e-10  # [-] likewise of the largest singular value of a scaled Jacobian
 TINY = 1e-300  # in place of a 0 in a denominator or a logarithm
 
@@ -131,17 +134,21 @@ def joint_covariance(linear: Linear, record: int, shared: np.ndarray) -> np.ndar
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric matrix >= 0, scaled first so that units do not matter; pseudo-inverse where singular."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), TINY))
-    scaled = matrix / scale / scale[:, None]
-    return np.linalg.pinv(scaled, rcond=NO_INFORMATION, hermitian=True) / scale / scale[:, None]
+    """Inverse of a symmetric matrix >= 0, scaled first so that units do not matter; 0 along what has no effect.
+
+    Rounding gives a direction without effect a little of one, and a little of each number: its large variance would
+    be theirs too.
+    """
+    root = _root(matrix)
+    return root @ root.T
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:
     """R (a, rank) with R R^T the `inverse` of a matrix."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), TINY))
+    effects = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale = np.where(effects > ROUNDING * effects.max(initial=0.0), effects, np.inf)
     sizes, vectors = np.linalg.eigh(matrix / scale / scale[:, None])
-    seen = sizes > NO_INFORMATION * max(sizes[-1], TINY)
+    seen = sizes > SAME_EFFECT * sizes.max(initial=TINY)
     return vectors[:, seen] / np.sqrt(sizes[seen]) / scale[:, None]
 
 

@@ -6,13 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffrigid.sysid.covariance import TINY, Linear, eliminated
+from diffrigid.sysid.covariance import ROUNDING, SAME_EFFECT, TINY, Linear, eliminated
 from diffrigid.sysid.free import Free
 
-SAME_EFFECT = (
-    1e-8  # [-] eigenvalue of the scaled information below which effects are the same: a correlation of 1 - 1e-8
-)
-ROUNDING = 1e-12  # [-] of the largest effect: a smaller one counts as none
 NEGLIGIBLE = 0.05  # [-] parts of a direction below this share of its largest are rounding, each as large as its effect
 LARGE = 1.0  # standard deviation, in the scale of a parameter (a factor e, or its size), that hardly determines it
 RARE = 1e-3  # chance below which residuals are not taken for noise

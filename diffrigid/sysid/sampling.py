@@ -20,7 +20,7 @@ from jax import Array
 
 from diffrigid.compiling import LASTING, compiled, uncollected
 from diffrigid.convert import at_least_one
-from diffrigid.sysid.covariance import TINY, inverse
+from diffrigid.sysid.covariance import TINY
 from diffrigid.sysid.intervals import coordinates_of, unit_of
 from diffrigid.sysid.levenberg import Numbers, Point, arrow, cost_of
 from diffrigid.sysid.losses import Loss
@@ -129,7 +129,8 @@ def _covariance(fit: Fit) -> np.ndarray:
     for k, slopes in enumerate(linear.slopes):
         at = np.concatenate([np.arange(a), a + k * b + np.arange(b)])
         information[np.ix_(at, at)] += slopes.T @ slopes / linear.variance
-    return inverse(information)
+    scale = np.sqrt(np.diag(information))  # so that units do not matter
+    return np.linalg.pinv(information / scale / scale[:, None], hermitian=True) / scale / scale[:, None]
 
 
 # ---- the density, of all chains at once
