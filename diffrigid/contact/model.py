@@ -114,7 +114,7 @@ class Contact:
             others, none = map(jax.checkpoint, (lambda *of: end(passes(*of)), lambda start, _: end(start)))
             return lax.cond(done < self.sweeps, others, none, start, done)
         if all(driven(world)):
-            return passes(start).state if ends_all(world) else end(passes(start))
+            return passes(start).state if _holds_all(world) else end(passes(start))
         near = may_meet(world, launch(state, t0), dt)
         return end(lax.cond(near, passes, lambda start: start, start))
 
@@ -163,10 +163,12 @@ def _rows(world: "World") -> int:
     return len(driven(world)) + is_rolling(world) * contact_count(world)
 
 
-def ends_all(world: "World") -> bool:
-    """Whether HOLD leaves all bodies at the end: each is joined to one with a motor or joint friction. Static."""
-    always, of = driven(world), ends(world)
-    held = {end for side in "ab" for end, acts in zip(of[side], always, strict=True) if acts}
+def _holds_all(world: "World") -> bool:
+    """Whether HOLD leaves all bodies of a world of motors and joint friction at the end of the step. Static.
+
+    Each body is then joined, perhaps through others, to one on which such a row acts.
+    """
+    held = {*ends(world)["a"], *ends(world)["b"]}
     return all(not held.isdisjoint(bodies) for bodies in islands(ends_of(world.joints), len(world.names)))
 
 
