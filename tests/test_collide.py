@@ -182,6 +182,8 @@ def test_a_body_of_many_worlds_meets_one_that_all_share(dim, kind_a, kind_b):
     for x_a, x_b in ((many, x), (x, many)):
         contacts = jax.eval_shape(COLLIDERS[kind_a, kind_b], a, x_a, q, b, x_b, q)
         assert contacts.gap.shape[1:] == (5,)
+        if (dim, kind_a, kind_b) in SOLID:
+            assert jax.eval_shape(core_separation, a, x_a, q, b, x_b, q).gap.shape == (1, 5)
 
 
 @pytest.mark.parametrize("names", [("tile", "box"), ("floor", "tile"), ("box", "post")])

@@ -28,6 +28,8 @@ def core_separation(a, x_a: Array, q_a: Array, b, x_b: Array, q_b: Array) -> Con
     """
     dim = len(x_a)
     corners_a, corners_b = corners_of(a, x_a, q_a), corners_of(b, x_b, q_b)
+    batch = jnp.broadcast_shapes(corners_a.shape[2:], corners_b.shape[2:])  # a static may be that of all worlds
+    corners_a, corners_b = (jnp.broadcast_to(some, some.shape[:2] + batch) for some in (corners_a, corners_b))
     parts = []
     if faces(b, dim):
         parts.append(_over_faces(corners_a, corners_b, faces(b, dim)))
