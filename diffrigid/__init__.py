@@ -63,6 +63,7 @@ from diffrigid.sysid import (
     segments,
     shares,
     student,
+    through,
 )
 from diffrigid.trajectory import Trajectory
 from diffrigid.view import Player, explore, play
@@ -145,6 +146,7 @@ __all__ = [
     "shares",
     "step",
     "student",
+    "through",
 ]
 
 

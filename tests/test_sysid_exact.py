@@ -132,6 +132,25 @@ def test_a_derived_number_has_the_interval_of_the_delta_method(fit, exact):
         assert_allclose([turn.value - turn.low, turn.high - turn.value], half, rtol=1e-5)
 
 
+def test_a_number_of_ones_own_is_as_sure_as_what_it_sets(fit, records):
+    """Sum and difference of the components of each launch, instead of these."""
+
+    def launch(world, state, value):
+        return dr.paths.write(world, state, "p.v", jnp.stack([value[0] + value[1], value[0] - value[1]]) / 2)
+
+    free = {key: kind for key, kind in FREE.items() if key != "p.v"}
+    free["launch"] = dr.each(dr.through(launch, dr.real(), (0.1, 0.0), "m/s"))
+    found = dr.fit(*point(), records, free=free, progress=False)
+    again = dr.fit(*point(), records, free=free, resume=found, iterations=1, progress=False)
+    assert_allclose(found["gravity"].value, fit["gravity"].value, atol=1e-6)
+    assert found["launch"].unit == "m/s"
+    for k in (0, RECORDS - 1):
+        expected = fit.derived(lambda _, state: jnp.stack([state.v[0].sum(), state.v[0, 0] - state.v[0, 1]]), record=k)
+        for end in ("value", "low", "high"):
+            assert_allclose(getattr(found["launch"], end)[k], getattr(expected, end), atol=3e-6)
+        assert_allclose(again["launch"].value[k], expected.value, atol=3e-6)
+
+
 @pytest.mark.parametrize("intervals", [sysid.from_jacobian, dr.sandwich])
 def test_a_parameter_that_is_derived_has_its_own_interval(fit, intervals):
     fit = fit.with_intervals(intervals)

@@ -19,7 +19,7 @@ from diffrigid.sysid.charts import direction, inertia, rotation, shares
 from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
 from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
 from diffrigid.sysid.fit import fit
-from diffrigid.sysid.free import each, interval, positive, prior, real
+from diffrigid.sysid.free import each, interval, positive, prior, real, through
 from diffrigid.sysid.gradient import first_order, lbfgs
 from diffrigid.sysid.losses import huber, squares, student
 from diffrigid.sysid.profile import profile, with_profiles
@@ -72,6 +72,7 @@ __all__ = [
     "squares",
     "start_vector",
     "student",
+    "through",
     "values_at",
     "with_profiles",
 ]

@@ -20,7 +20,7 @@ from diffrigid.sysid.free import Each, each
 from diffrigid.sysid.intervals import coordinates_of, interval_of, unit_of, unseen_of
 from diffrigid.sysid.levenberg import point_at
 from diffrigid.sysid.losses import Squares
-from diffrigid.sysid.parameters import Scene, make_slots, pieces, put, reference
+from diffrigid.sysid.parameters import Scene, make_slots, pieces, put, reference, written_by
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.records import Record
 from diffrigid.sysid.setup import Problem, first_numbers, first_value, make_problem, make_starts, scene_of
@@ -137,6 +137,7 @@ def best_launch(
     plan = partial(_problem, planned=planned, noise=noise, observe=observe, dt=dt)
     first_launch = plan([(world, state)], free=free)
     scene, shared, rows = scene_of(first_launch.runs[0]), first_launch.sizes[0], _rows_of(first_launch, target)
+    scene = scene._replace(written=written_by(vary, scene.state.x.dtype))
     slots = [slot for some in make_slots(vary, [scene]) for slot in some]
     about = [np.asarray(reference(slot, scene)) for slot in slots]
     of_each = sorted(free.items(), key=lambda item: isinstance(item[1], Each))  # launches share nothing

@@ -12,7 +12,7 @@ from diffrigid.state import State
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.columns import check_mapping
 from diffrigid.sysid.covariance import Intervals, Linear, check_intervals, from_jacobian
-from diffrigid.sysid.free import Each, Free, Prior
+from diffrigid.sysid.free import Each, Free, Prior, Through
 from diffrigid.sysid.intervals import describe
 from diffrigid.sysid.lead_in import better, growing, is_suspect
 from diffrigid.sysid.levenberg import INTERRUPTED, Numbers, Point, Report, cost_of, levenberg, point_at
@@ -37,7 +37,7 @@ def fit(
     state: State,
     observations: Any,
     *,
-    free: Mapping[str | tuple[str, ...], Free | Chart | Each | Prior],
+    free: Mapping[str | tuple[str, ...], Free | Chart | Each | Prior | Through],
     starts: int = 1,
     dt: float | None = None,
     noise: Mapping[str, Any] | None = None,
@@ -61,7 +61,8 @@ def fit(
             that control, each value held until the next. A list of such observations, or of `Record`, is fitted
             together.
         free: what may vary: a path (see `diffrigid.paths` and `diffrigid.sysid.sensors`), or a tuple of paths that
-            share one value. `each(kind)` gives every record its own, which begins as its first rows show it.
+            share one value. `each(kind)` gives every record its own, which begins as its first rows show it;
+            `through(write, kind, start)` is a number that sets several.
         starts: the first is at the values of `world` and `state`, the others are random.
         dt: [s] longest step; default 1.1 times the median of the intervals of t, but no more than 0.02 s where bodies
             touch, have joints, or forces vary.

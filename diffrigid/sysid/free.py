@@ -11,8 +11,9 @@ A kind of parameter is a frozen record with the verbs
     check(where, value)       raises ValueError for a start that the kind does not allow
     scale(reference)          (k,) a large change of z: the measure of how well the data determine it
 
-`each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds prior knowledge. Kinds with a
-condition on the value, such as directions, are in `charts`.
+`each(kind)` gives every record a value of its own; `prior(kind, mean, deviation)` adds prior knowledge;
+`through(write, kind, start)` is a number that is no leaf of the scene, but sets some. Kinds with a condition on the
+value, such as directions, are in `charts`.
 """
 
 from collections.abc import Callable
@@ -26,6 +27,8 @@ from jax import Array
 
 from diffrigid.convert import coefficient, known_number, numbers
 from diffrigid.pytree import Number, Vector
+from diffrigid.state import State
+from diffrigid.world import World
 
 NEAR_BOUND = 1e-3  # [-] of an interval: a start is pulled so far off a bound, a result this close is reported
 ON_BOUND = 0.1  # [-] likewise a start that is on it: what hardly rebounds comes to rest, and shows no restitution
@@ -108,6 +111,16 @@ class Prior:
     deviation: Any
 
 
+@dataclass(frozen=True)
+class Through:
+    """A parameter of the user's own, which a function writes into the scene."""
+
+    write: Callable[[World, State, Array], tuple[World, State]]
+    kind: Any
+    start: Any  # a number or a tuple
+    unit: str
+
+
 def interval(low: float, high: float) -> Free:
     """A parameter between two bounds, in its unit; random starts are anywhere between.
 
@@ -184,6 +197,36 @@ def prior(kind: Any, mean: Number | Vector, deviation: Number | Vector) -> Prior
         )
     given = (tuple(np.asarray(part, float).ravel().tolist()) for part in (mean, deviation))
     return Prior(kind, *given)
+
+
+def through(
+    write: Callable[[World, State, Array], tuple[World, State]], kind: Any, start: Number | Vector, unit: str = ""
+) -> Through:
+    """A number of your own that sets several of the scene: {"length": through(lengthen, positive(), 0.8, "m")}.
+
+    Args:
+        write: (world, state, value) -> (world, state) with the value written in, by `dr.paths.write`, which JAX can
+            trace. It comes after the other free numbers, but before densities and the coordinates of joints.
+        kind: `positive()`, `interval(low, high)` or another.
+        start: the value to begin with, a number or a vector.
+        unit: of the table.
+
+    Raises:
+        ValueError: write is no function, start not numbers, unit no string.
+
+    Example:
+        >>> def lengthen(world, state, length):  # a thin rod
+        ...     world, state = dr.paths.write(world, state, "rod.shape.half[0]", length / 2)
+        ...     mass = dr.paths.read(world, state, "rod.mass")
+        ...     return dr.paths.write(world, state, "rod.inertia", mass * length**2 / 12)
+        >>> free = {"length": dr.through(lengthen, dr.positive(), start=0.8, unit="m")}
+    """
+    if not callable(write) or isinstance(write, type):
+        raise ValueError(f"through: write is {write!r}, expected a function (world, state, value) -> (world, state)")
+    if not isinstance(unit, str):
+        raise ValueError(f"through: unit is {unit!r}, expected a string, such as 'm'")
+    numbers("through: start", start, None)
+    return Through(write, kind, np.asarray(start, float).tolist(), unit)
 
 
 def as_given(check: Callable, where: str, value: Any, *more: Any) -> float:

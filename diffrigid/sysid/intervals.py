@@ -203,6 +203,8 @@ def derived(
 def unit_of(problem: Problem, slot: Slot) -> str:
     """SI unit of a parameter; for a column the user's, unless its name is that of a quantity, and it is not scaled."""
     path, scene = slot.paths[0], scene_having(problem, slot)
+    if path in scene.written:
+        return scene.written[path].unit
     column, _, field = component(path)[0].rpartition(".")
     if field == "bias" and np.all(np.asarray(scene.channels[column].scale) == 1):
         return unit(scene.world, column)

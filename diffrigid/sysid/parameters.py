@@ -1,10 +1,11 @@
 """Free parameters of a scene: where each is, and how a vector z of numbers is written into the scene.
 
-Paths are those of `diffrigid.paths`, COLUMN.field for what `sensors` says of a column, and "clock" for the clock of all
-columns. Numbers that all records share come first in z, then those of which each record has its own.
+Paths are those of `diffrigid.paths`, COLUMN.field for what `sensors` says of a column, "clock" for the clock of all
+columns, and the names of what functions write into the scene (`through`). Numbers that all records share come first in
+z, then those of which each record has its own.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,11 +16,11 @@ from jax import Array
 
 from diffrigid import paths
 from diffrigid.catalogue import component, hint, order_of
-from diffrigid.pytree import replace
+from diffrigid.pytree import replace, static
 from diffrigid.state import State
 from diffrigid.sysid.channels import is_record, parts_of
 from diffrigid.sysid.charts import Chart
-from diffrigid.sysid.free import Each, Free, Prior
+from diffrigid.sysid.free import Each, Free, Prior, Through
 from diffrigid.sysid.sensors import Channel, is_turn
 from diffrigid.world import World
 
@@ -27,12 +28,23 @@ from diffrigid.world import World
 CONDITIONED = {"normal": "direction", "axis_a": "direction", "axis_b": "direction", "q": "rotation", "zero": "rotation"}
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Written:
+    """A parameter that a function writes into the scene."""
+
+    value: Array
+    write: Callable[[World, State, Array], tuple[World, State]] = static(kw_only=False)
+    unit: str = static(kw_only=False)
+
+
 class Scene(NamedTuple):
-    """World, state and columns: all that parameters are part of."""
+    """World, state and columns: all that parameters are part of; and those that functions write into them."""
 
     world: World
     state: State
     channels: dict[str, Channel]
+    written: dict[str, Written]
 
 
 @dataclass(frozen=True)
@@ -53,6 +65,8 @@ class Slot:
 
 def read(scene: Scene, path: str) -> Array:
     """Value of a parameter of the world, the initial state, or a column."""
+    if path in scene.written:
+        return scene.written[path].value
     of_columns = channel_paths(scene.channels)
     if path not in of_columns:
         return paths.read(scene.world, scene.state, path)
@@ -64,9 +78,14 @@ def read(scene: Scene, path: str) -> Array:
 
 def write(scene: Scene, path: str, value: Array) -> Scene:
     """The scene with one parameter changed."""
+    if path in scene.written:
+        own = replace(scene.written[path], value=value)
+        world, state = own.write(scene.world, scene.state, value)
+        return scene._replace(world=world, state=state, written={**scene.written, path: own})
     of_columns, channels = channel_paths(scene.channels), scene.channels
     if path not in of_columns:
-        return Scene(*paths.write(scene.world, scene.state, path, value), channels)
+        world, state = paths.write(scene.world, scene.state, path, value)
+        return scene._replace(world=world, state=state)
     for chain in of_columns[path]:
         channels = _updated(channels, chain, value)
     return scene._replace(channels=channels)
@@ -74,7 +93,8 @@ def write(scene: Scene, path: str, value: Array) -> Scene:
 
 def knows(scene: Scene, path: str) -> bool:
     """Whether the scene has such a parameter."""
-    return path in channel_paths(scene.channels) or component(path)[0] in paths.catalogue(scene.world)
+    known = channel_paths(scene.channels), scene.written
+    return any(path in names for names in known) or component(path)[0] in paths.catalogue(scene.world)
 
 
 def channel_paths(channels: dict[str, Channel]) -> dict[str, list[tuple[str, ...]]]:
@@ -132,9 +152,26 @@ def put(slots: Sequence[Slot], scene: Scene, z: Array) -> Scene:
             value = slot.kind.value(z[rows], reference(slot, scene))
             numbers += [(path, value[k] if slot.is_vector else value) for k, path in enumerate(slot.paths)]
     # In order: joints move bodies once anchors and velocities are as they will be.
-    for path, value in sorted(numbers, key=lambda number: order_of(scene.world, number[0])):
+    for path, value in sorted(numbers, key=lambda n: (order_of(scene.world, n[0]), n[0] in scene.written)):
         scene = write(scene, path, value)
     return scene
+
+
+def written_by(free: Any, dtype: Any) -> dict[str, Written]:
+    """The parameters of `free` that functions write into the scene, at their start."""
+    own = {key: _kind_in(kind) for key, kind in free.items()} if isinstance(free, Mapping) else {}
+    return {
+        key: Written(jnp.asarray(kind.start, dtype), kind.write, kind.unit)
+        for key, kind in own.items()
+        if isinstance(kind, Through) and isinstance(key, str)
+    }
+
+
+def _kind_in(kind: Any) -> Any:
+    """The kind inside `each` and `prior`."""
+    while isinstance(kind, Each | Prior):
+        kind = kind.kind
+    return kind
 
 
 def make_slots(free: Mapping[Any, Any], scenes: Sequence[Scene]) -> tuple[tuple[Slot, ...], tuple[Slot, ...]]:
@@ -169,10 +206,13 @@ def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unli
     if not names or not all(isinstance(name, str) for name in names):
         raise ValueError(f"free has the key {key!r}: expected a path such as 'ball.mass', or a tuple of paths")
     prior, kind = (kind, kind.kind) if isinstance(kind, Prior) else (None, kind)
+    own, kind = (kind, kind.kind) if isinstance(kind, Through) else (None, kind)
     if not isinstance(kind, Free | Chart):
         raise ValueError(
             f"free[{key!r}]: expected interval(low, high), positive(), real() or another kind, got {kind!r}"
         )
+    if own is not None:
+        _refuse_written(key, own, unlike)
     having = [scene for scene in scenes if all(knows(scene, name) for name in names)]
     if not having or several and len(having) < len(scenes):
         _refuse(names, having, scenes)
@@ -186,7 +226,8 @@ def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unli
         raise ValueError(f"free[{key!r}]: paths of shapes {sorted(shapes)}, expected {expected}")
     shape = reference(slot, having[0]).shape
     size = kind.size(shape)
-    _refuse_kind(key, kind, component(names[0])[0].rpartition(".")[2], having[0].world.dim)
+    if own is None:
+        _refuse_kind(key, kind, component(names[0])[0].rpartition(".")[2], having[0].world.dim)
     for scene in having:
         kind.check(f"free[{key!r}]", np.asarray(reference(slot, scene)))
     if prior is not None and len(prior.mean) not in (1, int(np.prod(shape))):
@@ -203,6 +244,23 @@ def _refuse_kind(key: Any, kind: Free | Chart, field: str, dim: int) -> None:
         raise ValueError(f"free[{key!r}]: expected {CONDITIONED[field]}(), which keeps its length")
     elif field == "inertia" and dim == 3:
         raise ValueError(f"free[{key!r}]: expected inertia(), which keeps the tensor one that a body can have")
+
+
+def _refuse_written(key: Any, own: Through, scenes: Sequence[Scene]) -> None:
+    """Raise ValueError for a parameter of the user's own that has the name of another, or does not give a scene."""
+
+    def written(world: World, state: State, value: Array) -> None:
+        before, made = (jax.tree.map(jnp.shape, pair) for pair in ((world, state), own.write(world, state, value)))
+        if made != before:
+            raise ValueError(
+                f"free[{key!r}]: expected that write returns (world, state) with the same arrays as before, such as "
+                "dr.paths.write(world, state, path, value) does"
+            )
+
+    for scene in scenes:
+        if not isinstance(key, str) or knows(scene._replace(written={}), key):
+            raise ValueError(f"free[{key!r}]: expected a name of its own for what `through` writes, not paths")
+        jax.eval_shape(written, scene.world, scene.state, scene.written[key].value)
 
 
 def _refuse_ambiguous(names: tuple[str, ...], scenes: Sequence[Scene]) -> None:

@@ -86,7 +86,7 @@ def _group(
     found: list[Run], members: tuple[int, ...], slots: Sequence[Slot], priors: tuple[float, ...], longest: float
 ) -> Group:
     dtype = found[0].state.x.dtype
-    scenes = [Scene(run.world, run.state, run.channels) for run in found]
+    scenes = [Scene(run.world, run.state, run.channels, run.written) for run in found]
     absent = [not all(knows(scenes[0], path) for path in slot.paths) for slot in slots]  # their z does nothing here
     here = tuple(replace(s, paths=(), prior=None) if off else s for s, off in zip(slots, absent, strict=True))
     freed = {path for slot in here for path in slot.paths}

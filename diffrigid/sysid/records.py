@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,7 @@ class Run:
     noise: Mapping[str, Any]
     controls: tuple[Series, ...] = ()  # each held from one of its times to the next
     stated: bool = False  # its initial state was given with it
+    written: dict[str, Any] = field(default_factory=dict)  # see `parameters.Written`
 
 
 def series_of(run: Run, name: str) -> Series:

@@ -18,7 +18,7 @@ from diffrigid.step import floats
 from diffrigid.sysid.first_rows import begun
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers
-from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write
+from diffrigid.sysid.parameters import Scene, Slot, knows, make_slots, put, reference, write, written_by
 from diffrigid.sysid.problem import Group, full_turn, known, make_groups
 from diffrigid.sysid.records import Run, noise_guess, runs, series_of
 from diffrigid.sysid.times import longest_step
@@ -89,7 +89,8 @@ def make_problem(
     """
     found = runs(world, state, observations, observe or {}, noise)
     pairs = [floats(run.world, run.state) for run in found]
-    found = [replace(run, world=w, state=s) for run, (w, s) in zip(found, pairs, strict=True)]
+    written = written_by(free, pairs[0][1].x.dtype)
+    found = [replace(run, world=w, state=s, written=written) for run, (w, s) in zip(found, pairs, strict=True)]
     shared, own = make_slots(free, [scene_of(run) for run in found])
     if begin:
         found = [run if run.stated else begun(run, own) for run in found]
@@ -128,7 +129,7 @@ def _common_width(found: Sequence[Run]) -> float:
 
 def scene_of(run: Run) -> Scene:
     """The scene of a record."""
-    return Scene(run.world, run.state, run.channels)
+    return Scene(run.world, run.state, run.channels, run.written)
 
 
 def with_noise(
@@ -197,7 +198,7 @@ def _resumed(found: list[Run], saved: Any, slots: Sequence[Slot], places: Sequen
                 value = p.value[place] if p.records else p.value
                 for k, path in enumerate(slot.paths):
                     scene = write(scene, path, jnp.asarray(value[k] if slot.is_vector else value, scene.state.x.dtype))
-        out.append(replace(run, world=scene.world, state=scene.state, channels=scene.channels))
+        out.append(replace(run, **scene._asdict()))
     return out
 
 
