@@ -13,6 +13,8 @@ import diffrigid as dr
 from diffrigid import so3
 from diffrigid.collide import COLLIDERS, CONVEX_2D, CONVEX_3D
 from diffrigid.collide.penetration import core_separation
+from diffrigid.contact.approach import Task, polish
+from diffrigid.contact.gaps import Gaps
 from diffrigid.overlap import outlines, place, separation
 from diffrigid.shapes import radius, with_topology
 from diffrigid.state import rotations
@@ -184,6 +186,15 @@ def test_a_body_of_many_worlds_meets_one_that_all_share(dim, kind_a, kind_b):
         assert contacts.gap.shape[1:] == (5,)
         if (dim, kind_a, kind_b) in SOLID:
             assert jax.eval_shape(core_separation, a, x_a, q, b, x_b, q).gap.shape == (1, 5)
+
+
+def test_a_gap_that_opens_again_far_off_does_not_hold_up_the_search():
+    """Beside one that closes: features that a list lacks are far, and turn with the body."""
+    one, gaps = jnp.ones(()), jnp.array([[1e-6, 1e6], [-0.1, -1e-7], [0.0, 0.3]])
+    task = Task(a=None, b=None, start=0 * one, t1=one / 60, size=one, slow=1e-3 * one, width=None, rested=one < 0)
+    look = polish(task, Gaps(*gaps, pull=gaps[2], normal=jnp.zeros((2, 3))), jnp.zeros(2, bool), 0 * one, 0 * one)
+    assert_allclose(look.dt, 1e-5, rtol=1e-9)
+    assert look.closes
 
 
 @pytest.mark.parametrize("names", [("tile", "box"), ("floor", "tile"), ("box", "post")])

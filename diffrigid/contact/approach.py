@@ -21,6 +21,7 @@ from diffrigid.state import rotations
 
 WANDER = 1.1  # [-] growth allowed to the angular speed of a free body in 3D within a step
 FALLEN = 0.25  # [-] least depth over rate and time of what fell from rest, by an acceleration that grows as t^2
+LITTLE = 0.1  # [-] of the height of a gap: one that opens again without having closed by more does not meet on its way
 TOUCH_ROUNDING = 1e5  # [-] times eps times the near distance: gap that rounding may leave at touching bodies
 
 
@@ -161,7 +162,8 @@ def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Poli
     closing = _least(jnp.where(rests, jnp.inf, jnp.where(there, 0.0, _time_to(height, v, acc))))
     dt = closing
     if gaps.normal is not None:  # it turns: whether the gap opens again is only known from a look at where it would
-        opens = (v < 0) & (height > 0) & (v * v < 2.0 * acc * height) & ~rests
+        falls = safe_divide(v * v, 2.0 * acc * height)  # [-] of its height, until then
+        opens = (v < 0) & (height > 0) & (LITTLE < falls) & (falls < 1.0) & ~rests
         turns = jnp.where(opens, safe_divide(-v, acc), 0.0)
         dt = jnp.minimum(dt, _least(jnp.where(turns > (slack * task.span)[None], turns, jnp.inf)))
     # A later time is no impact; but a step to a little beyond the end does not decide that yet.
