@@ -5,15 +5,17 @@ of which no two are coupled is eliminated at once, then a set of those that are 
 second joint goes first, so that 100 links take seven such levels. Which joints those are, and which blocks fill in,
 is found when tracing, from which bodies are joined.
 
-The matrix is positive semidefinite, so no pivoting is needed. A pivot that is zero to rounding, as of an equation
-that repeats others, is left out: the solution is then one of many, and finite. Where joints form a tree there is none.
+The matrix is positive semidefinite, so no pivoting is needed. Where joints form loops, an equation may repeat others:
+its pivot is rounding, by which nothing can be divided. So a little is added to the diagonal there, much more than
+rounding, and the solution refined: it is then one of many, and finite. Where joints form a tree there is none.
 Source: George & Liu, Computer Solution of Large Sparse Positive Definite Systems, 1981, chapters 4 and 5;
+for what is added Riley 1955, Solving systems of linear equations with a positive definite, but ill-conditioned matrix;
 for every second joint of a chain Hockney 1965 (cyclic reduction); for joints Baraff, Linear-time dynamics using
 Lagrange multipliers, SIGGRAPH 1996.
 """
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -23,7 +25,8 @@ from jax import Array, lax
 from diffrigid.fence import unfused
 from diffrigid.gathers import rows
 
-PIVOT_ROUNDING = 1e2  # [-] times eps times the diagonal: where joints form loops, a pivot no larger counts as zero
+YIELDING = 0.6  # eps to this power, of the diagonal, is added to it where joints form loops
+REFINEMENTS = 2  # rounds after which a solution is that without this
 
 
 class Level(NamedTuple):
@@ -149,24 +152,33 @@ class Factor(NamedTuple):
 
 def factorise(plan: Plan, blocks: Array) -> tuple[Factor, ...]:
     """Factors of all levels, from blocks (n + pairs, E, E, *batch) of joints with themselves, then of `plan.pairs`."""
-    count, rounding = len(plan.places), 0.0 if plan.is_tree else PIVOT_ROUNDING * jnp.finfo(blocks.dtype).eps
-    tiny = rounding * jnp.stack([blocks[:count, e, e] for e in range(blocks.shape[1])], axis=1)
+    if not plan.is_tree:
+        own = blocks[: len(plan.places)]
+        diagonal = jnp.eye(own.shape[1], dtype=own.dtype).reshape(*own.shape[1:3], *[1] * (own.ndim - 3))
+        yielding = float(jnp.finfo(own.dtype).eps) ** YIELDING
+        blocks = jnp.concatenate([own + yielding * diagonal[None] * own, blocks[len(own) :]])
     factors = []
     for level in plan.levels:
         own = rows(blocks, level.blocks)
-        inverse, near = unfused(_inverse, own[:, 0], rows(tiny, level.pivots)), own[:, 1:]
+        inverse, near = unfused(_inverse, own[:, 0]), own[:, 1:]
         ready = _product(inverse[:, None], near, 2)
         factors.append(Factor(inverse, ready))
         if level.kept:
             product = _product(jnp.swapaxes(near, 2, 3)[:, :, None], ready[:, None], 3)
             taken = product.reshape(-1, *product.shape[3:])
             blocks = _less(rows(blocks, level.kept), taken, level.sums)
-            tiny = rows(tiny, level.kept_rows)
     return tuple(factors)
 
 
-def substitute(plan: Plan, factors: tuple[Factor, ...], right: Array) -> Array:
-    """Solve for a right-hand side (n, E, *batch)."""
+def solve(plan: Plan, factors: tuple[Factor, ...], product: Callable[[Array], Array], right: Array) -> Array:
+    """Solve for a right-hand side (n, E, *batch); `product` multiplies by the matrix."""
+    x = _substituted(plan, factors, right)
+    for _ in range(0 if plan.is_tree else REFINEMENTS):
+        x = x + _substituted(plan, factors, right - product(x))
+    return x
+
+
+def _substituted(plan: Plan, factors: tuple[Factor, ...], right: Array) -> Array:
     pivots, right = [], right[:, :, None]
     for level, factor in zip(plan.levels, factors, strict=True):
         own = rows(right, level.pivots)
@@ -184,13 +196,13 @@ def substitute(plan: Plan, factors: tuple[Factor, ...], right: Array) -> Array:
     return rows(x, plan.places)[:, :, 0]
 
 
-def _inverse(matrix: Array, tiny: Array) -> Array:
-    """Invert matrices (P, E, E, *batch) by sweeps (Beaton 1964); pivots up to `tiny` (P, E, *batch) are left out."""
+def _inverse(matrix: Array) -> Array:
+    """Invert matrices (P, E, E, *batch) by sweeps (Beaton 1964); pivots of zero are left out."""
 
     def sweep(k, matrix):
         column = lax.dynamic_index_in_dim(matrix, k, 2, keepdims=False)
-        pivot, least = (lax.dynamic_index_in_dim(leaf, k, 1, keepdims=False) for leaf in (column, tiny))
-        usable = pivot > least
+        pivot = lax.dynamic_index_in_dim(column, k, 1, keepdims=False)
+        usable = pivot > 0
         share = jnp.where(usable, -1.0 / jnp.where(usable, pivot, 1.0), 0.0)[:, None]
         hit = lax.broadcasted_iota(np.int32, column.shape, 1) == k
         row = lax.dynamic_index_in_dim(matrix, k, 1, keepdims=False)

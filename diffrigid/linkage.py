@@ -28,7 +28,7 @@ from diffrigid.constraints import (
     of_each,
     placed,
 )
-from diffrigid.elimination import Factor, factorise, plan_of, substitute
+from diffrigid.elimination import Factor, factorise, plan_of, solve
 from diffrigid.fence import at_hand, unfused
 from diffrigid.gathers import rows
 from diffrigid.joints import Pose
@@ -139,10 +139,8 @@ def _multipliers(link: Linkage, target: Array) -> Array:
     def product(lam: Array) -> Array:
         return _rates(link, _moved(link, _pull(link, lam)))
 
-    def solve(_, right: Array) -> Array:
-        return substitute(plan_of(link.ends, len(link.inverse_mass)), link.factors, right)
-
-    return lax.custom_linear_solve(product, -target, solve, symmetric=True)
+    solved = functools.partial(solve, plan_of(link.ends, len(link.inverse_mass)), link.factors)
+    return lax.custom_linear_solve(product, -target, solved, symmetric=True)
 
 
 def spread(link: Linkage, dv: Array, dw: Array) -> tuple[Array, Array, Array]:
