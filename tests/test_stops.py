@@ -342,6 +342,31 @@ def test_friction_turns_back_with_the_motion():
 
 
 @pytest.mark.slow
+def test_friction_that_turns_back_feels_that_of_the_other_hinge():
+    """Two links whose first hinge slips one way: its friction is a torque, by which the second stops a little sooner."""
+
+    def after(rubs, size):
+        bodies = {
+            "a": dr.Body(None, mass=1.0, inertia=0.04, x=(0.3, 0.0)),
+            "b": dr.Body(None, mass=0.6, inertia=0.02, x=(0.8, 0.05)),
+        }
+        joints = {
+            "shoulder": dr.Revolute("a", anchor_a=(-0.3, 0.0), friction=size if rubs else None),
+            "elbow": dr.Revolute("b", "a", anchor_a=(-0.2, -0.05), friction=0.6),
+        }
+        forces = [] if rubs else [dr.Torque("a", tau=-size)]
+        world, state = dr.scene(bodies, gravity=(0.0, -9.81), joints=joints, forces=forces)
+        for path, rate in {"shoulder.rate": 2.0, "elbow.rate": -3.0}.items():
+            world, state = dr.paths.write(world, state, path, rate)
+        return dr.rollout(world, state, dt=1 / 120, steps=8).state.w[-1, :, 0]
+
+    rubs, turned = (jax.jit(lambda F, r=r: jax.jvp(lambda F: after(r, F), (F,), (1.0,)))(1.0) for r in (True, False))
+    assert turned[0][1] > turned[0][0]  # the elbow has turned back
+    assert_allclose(rubs[0], turned[0], atol=1e-4)  # [rad/s]
+    assert_allclose(rubs[1], turned[1], atol=1e-3)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.0, 50.0])
 def test_what_a_joint_of_a_linkage_does_acts_in_the_middle_of_a_step(speed):
     """The friction, or a motor, of the second hinge of a swinging chain, beside the same moment as a `Torque`.

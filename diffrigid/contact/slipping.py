@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from diffrigid.contact.cone import put, split, turning
@@ -71,18 +72,27 @@ def rubbing(strikes: Strikes, P: Array, law: Law) -> tuple[Callable, Array]:
 
 
 def pulled(mobility: Mobility, strikes: Strikes, P: Array, most: Array | None, T: Array) -> tuple[Strikes, Array]:
-    """Strikes with the pull on contacts by rows of joints that push with all they have, and what v_rel gains by it.
+    """Strikes with the pull by rows of joints that push with all they have, and what v_rel gains by it.
 
-    A motor or joint friction that does not hold its speed acts as a constant force.
+    A motor or joint friction that does not hold its speed acts as a constant force, on all but itself.
     """
     if most is None:
         return strikes, jnp.zeros_like(P)
     limited = jnp.isfinite(most)
     pushes = limited & (jax.vmap(norm)(P) >= STICKS * jnp.where(limited, most, 0.0))
-    by = moved(jnp.where(pushes[:, None], P, 0.0), strikes, mobility)
-    by = jnp.where(limited[:, None], 0.0, by)
+    pushing = jnp.where(pushes[:, None], P, 0.0)
+    by = moved(pushing, strikes, mobility)
+    own = by if len(strikes.jac) == 1 else _by_themselves(pushing, strikes, mobility)
+    by = by - jnp.where(limited[:, None], own, 0.0)
     pull = strikes.pull + by / jnp.where(T > 0, T, 1.0)[:, None]
     return replace(strikes, v_rel=strikes.v_rel + by, pull=pull), by
+
+
+def _by_themselves(P: Array, strikes: Strikes, mobility: Mobility) -> Array:
+    """What the slip of each row of a joint gains by its own impulse, (C, D, *batch) [m/s]; 0 for contacts."""
+    alone = np.eye(len(P))[-len(strikes.jac) :].reshape(-1, *P.shape[:1], *[1] * (P.ndim - 1))
+    each = jax.vmap(lambda one: one * moved(one * P, strikes, mobility))(alone.astype(P.dtype))
+    return each.sum(0)
 
 
 def slips(part: Callable, strikes: Strikes, target: Array, T: Array) -> tuple[Array, Array]:
