@@ -13,8 +13,12 @@ LISTED = 9  # numbers that are listed, and not only their shape: of an inertia
 
 
 def listing(world: World) -> str:
-    """Values and units of all parameters, those of one owner in a line; of many numbers, or traced ones, the shape."""
-    names = world.names + world.static_names
+    """Values and units of all parameters, those of one owner in a line; of many numbers, or traced ones, the shape.
+
+    A coefficient that a body or static was given is marked as its own: beside one that was not, it is that of both.
+    """
+    names, own_of = world.names + world.static_names, dict(world.own)
+    none = (False,) * len(names)
     lines: dict[str, list[str]] = {}
     kinds: dict[str, Any] = dict(zip(world.force_names, world.forces, strict=True)) | {"contact": world.contact}
     for joints, joint in zip(world.joint_names, world.joints, strict=True):
@@ -26,7 +30,9 @@ def listing(world: World) -> str:
         owner, _, field = path.partition(".")
         if field and place.chain[0] == 0 and not (place.angle or place.solid):
             value, measure = _shown(leaf_of((world, None), place), place.row), unit(world, path)
-            lines.setdefault(owner, []).append(f"{field.removeprefix('shape.')} {value} {measure}".rstrip())
+            own = "(own)" if owner in names and own_of.get(field, none)[names.index(owner)] else ""
+            words = field.removeprefix("shape."), value, measure, own
+            lines.setdefault(owner, []).append(" ".join(filter(None, words)))
     of_kind = {owner: [type(record).__name__] for owner, record in kinds.items()} | of_shapes
     kind = {owner: f" ({', '.join(of_kind[owner])})" if owner in of_kind else "" for owner in lines}
     listed = [f"{owner}{kind[owner]}: {', '.join(values)}" for owner, values in lines.items()]

@@ -225,7 +225,7 @@ def test_a_world_prints_its_parameters():
     lines = repr(FLAT[0]).splitlines()
     assert lines[0] == "World, 2D"
     assert "rope (SpringDamper): anchor_a [0, 0] m, anchor_b [0.1, 0] m, stiffness 3 N/m" in "\n".join(lines)
-    assert "cue (Disc): mass 1 kg, inertia 0.08 kg m^2, restitution 0.3, friction 0.2, radius 0.4 m" in lines
+    assert "cue (Disc): mass 1 kg, inertia 0.08 kg m^2, restitution 0.3 (own), friction 0.2, radius 0.4 m" in lines
     listed = {path for path in paths.catalogue(SOLID[0]) if "." in path} - {
         f"{name}.{field}" for name in SOLID[0].names for field in ("x", "q", "v", "w", "density")
     }

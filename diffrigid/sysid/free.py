@@ -225,7 +225,8 @@ def through(
         raise ValueError(f"through: write is {write!r}, expected a function (world, state, value) -> (world, state)")
     if not isinstance(unit, str):
         raise ValueError(f"through: unit is {unit!r}, expected a string, such as 'm'")
-    numbers("through: start", start, None)
+    if not numbers("through: start", start, None).size:
+        raise ValueError("through: start is empty, expected a number, or those of a vector")
     return Through(write, kind, np.asarray(start, float).tolist(), unit)
 
 

@@ -17,7 +17,7 @@ from jax import Array
 from diffrigid import paths
 from diffrigid.catalogue import component, hint, order_of
 from diffrigid.pytree import replace, static
-from diffrigid.state import State
+from diffrigid.state import COEFFICIENTS, State
 from diffrigid.sysid.channels import is_record, parts_of
 from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.free import Each, Free, Prior, Through
@@ -250,7 +250,7 @@ def _refuse_written(key: Any, own: Through, scenes: Sequence[Scene]) -> None:
     """Raise ValueError for a parameter of the user's own that has the name of another, or does not give a scene."""
 
     def written(world: World, state: State, value: Array) -> None:
-        before, made = (jax.tree.map(jnp.shape, pair) for pair in ((world, state), own.write(world, state, value)))
+        before, made = (jax.tree.map(np.shape, pair) for pair in ((world, state), own.write(world, state, value)))
         if made != before:
             raise ValueError(
                 f"free[{key!r}]: expected that write returns (world, state) with the same arrays as before, such as "
@@ -283,7 +283,9 @@ def _refuse_overlaps(slots: Sequence[Slot], scene: Scene) -> None:
         for place in known.get(whole, []):
             for row, item, other in taken.setdefault(place.chain, []):
                 if all(a is None or b is None or a == b for a, b in ((row, place.row), (item, index))):
-                    raise ValueError(f"free: {other!r} and {path!r} set the same number: leave one out")
+                    general = {other, path} & {*COEFFICIENTS}
+                    hint = f", or free {min(general)} by bodies and statics only" if general else ""
+                    raise ValueError(f"free: {other!r} and {path!r} set the same number: leave one out{hint}")
             taken[place.chain].append((place.row, index, path))
 
 

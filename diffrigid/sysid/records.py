@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from diffrigid.controls import controlled
-from diffrigid.convert import known_number
+from diffrigid.convert import known_number, positive
 from diffrigid.state import State
 from diffrigid.sysid.columns import Series, check_mapping, columns, odd_speeds
 from diffrigid.sysid.free import as_given
@@ -101,6 +101,8 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
     state = state if record.state is None else record.state
     check_mapping(f"{where}.noise", record.noise)
     check(world, state)
+    for name, mass in zip(world.names, np.asarray(world.bodies.mass), strict=True):
+        positive(f"{name}.mass", mass, "begin with another")
     series, channels, controls = columns(world, record.observations, observe, where)
     names = [s.name for s in series]
     own = dict(record.noise or {})

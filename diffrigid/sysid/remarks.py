@@ -1,6 +1,6 @@
 """Remarks of a fit on its result as a whole, apart from the uncertainty of its numbers."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -11,6 +11,7 @@ from jax import Array
 from diffrigid.catalogue import catalogue, component
 from diffrigid.constraints import joint_errors, placed
 from diffrigid.flight import has_torque
+from diffrigid.forces import Gravity, GroundFriction
 from diffrigid.joint_motion import fields_of, moving_side
 from diffrigid.paths import read, write
 from diffrigid.shapes import Disc, Sphere
@@ -25,6 +26,7 @@ from diffrigid.sysid.parameters import Scene, pieces
 from diffrigid.sysid.points import linear_of
 from diffrigid.sysid.problem import full_turn
 from diffrigid.sysid.records import Run
+from diffrigid.sysid.sensors import JointPart
 from diffrigid.sysid.setup import Problem
 from diffrigid.sysid.table import ENDED
 from diffrigid.world import World, seats
@@ -145,8 +147,19 @@ def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], least: 
     return (
         f"the fit failed: residuals of {', '.join(dict.fromkeys(names))} are {size} the motion; look at units (m, s, "
         "rad; degrees need scale=180 / pi), at signs, and at the values to begin with, or try more starts; the start "
-        f"has to be free where it is not known{several}"
+        f"has to be free where it is not known{several}{''.join(_lacking(problem))}"
     )
+
+
+def _lacking(problem: Problem) -> Iterator[str]:
+    """What the scene of a fit that failed may lack, or be given the other way round."""
+    world, channels = problem.runs[0].world, problem.runs[0].channels
+    if not (world.pairs or world.crowd):
+        yield "; no two shapes of this scene can meet: does it lack a floor?"
+    if not any(isinstance(force, Gravity | GroundFriction) for force in world.forces):
+        yield "; it has no gravity"
+    if any(isinstance(channel.observer, JointPart) for channel in channels.values()):
+        yield "; an angle of a hinge is that of its first body relative to its second: look at their order"
 
 
 def _is_lost(run: Run, name: str, values: np.ndarray, residuals: np.ndarray, least: float) -> bool:

@@ -25,7 +25,7 @@ from diffrigid.sysid.points import by_column
 from diffrigid.sysid.records import SAME_TIME, runs, same_data
 from diffrigid.sysid.setup import Problem, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Parameter, Summary
-from diffrigid.sysid.table import summary_html, summary_text
+from diffrigid.sysid.table import doubts_of, summary_html, summary_text
 from diffrigid.sysid.times import all_times, motion
 from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
@@ -221,6 +221,7 @@ class Fit:
 
         The interval is symmetric, to first order in the errors of the fit, and uses the covariance and quantile of
         those in the table (also after `with_intervals`). It is infinite where the data do not determine the number.
+        Its `note` says why not to trust it, if the fit as a whole is doubtful.
 
         Args:
             fn: of the world and the initial state, in operations of JAX.
@@ -234,9 +235,10 @@ class Fit:
             >>> bool(lost.low < 1.0 - 0.8**2 < lost.high)  # share of the energy that an impact takes
             True
         """
-        return derived(
+        found = derived(
             self.problem, self.shared, self.own, self.linear, self.uncertainty, fn, checked_record(self, record)
         )
+        return replace(found, note="; ".join(doubts_of(self.summary)))
 
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap.

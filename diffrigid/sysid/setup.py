@@ -25,7 +25,7 @@ from diffrigid.sysid.times import longest_step
 from diffrigid.world import World
 
 MANY_STEPS = 50_000  # steps of a record beyond which the unit of its times is doubted
-SPARSE = 40  # likewise steps from one row to the next, where their length was not given
+SPARSE, TOO_SPARSE = 40, 400  # likewise steps from one row to the next, where their length was not given; and refused
 
 
 @dataclass(frozen=True)
@@ -108,15 +108,21 @@ def make_problem(
 
 
 def _doubt_times(found: Sequence[Run], longest: float, given: bool) -> None:
-    """Warn of times that would take very many steps of `longest` [s], whose length the user gave or not."""
+    """Warn of times that would take very many steps of `longest` [s], whose length the user gave or not.
+
+    Raises:
+        ValueError: so many between two rows that it is hardly meant.
+    """
     lasts = max(float(series.t[-1]) - run.start for run in found for series in run.series)
     apart = float(np.median(np.concatenate([np.diff(series.t) for run in found for series in run.series])))
     if lasts > MANY_STEPS * longest or (apart > SPARSE * longest and not given):
-        warnings.warn(
+        text = (
             f"a record lasts {lasts:.3g} s, with rows {apart:.2g} s apart, which takes {lasts / longest:.2g} steps of "
-            f"{longest:.2g} s: if its times are in ms, or numbers of frames, make them seconds; otherwise give dt",
-            stacklevel=4,
+            f"{longest:.2g} s: if its times are in ms, or numbers of frames, make them seconds; otherwise give dt"
         )
+        if apart > TOO_SPARSE * longest and not given:
+            raise ValueError(text)
+        warnings.warn(text, stacklevel=4)
 
 
 def _common_width(found: Sequence[Run]) -> float:
@@ -194,7 +200,7 @@ def _resumed(found: list[Run], saved: Any, slots: Sequence[Slot], places: Sequen
         scene = scene_of(run)
         for slot in slots:
             p = parameters.get(slot.name)
-            if p is not None and not (p.records and place is None):
+            if p is not None and not (p.records and (place is None or place >= p.records)):
                 value = p.value[place] if p.records else p.value
                 for k, path in enumerate(slot.paths):
                     scene = write(scene, path, jnp.asarray(value[k] if slot.is_vector else value, scene.state.x.dtype))

@@ -16,7 +16,8 @@ BLIND = "not determined, see below"  # note of a parameter with a number that ha
 STICKS = "larger values fit as well, see below"  # likewise of a friction that ended where what slipped sticks
 ENDED = " ended where what slips begins to stick"  # behind its name, the beginning of the remark on it
 BOUND = "at its bound"  # note of a parameter that ended there
-DOUBTS = ("the fit failed", "not converged", "the cost jumps")  # beginnings of notes that concern every number
+# Beginnings of notes that concern every number.
+DOUBTS = ("the fit failed", "not converged", "the cost jumps", "residuals are autocorrelated")
 TABLE_RECORDS = 3  # records whose own numbers are in the table
 
 
@@ -53,11 +54,16 @@ def _number(p: Any, index: tuple[int, ...]) -> tuple[str, float, float, float, s
 def numbers(summary: "Summary") -> list[dict[str, Any]]:
     """Every number, those of all records too, unrounded: a dictionary of parameter, value, low, high, unit, note."""
     names = ("parameter", "value", "low", "high", "unit", "note")
-    doubts = [doubt for doubt in DOUBTS if any(note.startswith(doubt) for note in summary.notes)]
+    doubts = doubts_of(summary)
     found = [_number(p, index) for p in summary.parameters for index in np.ndindex(p.value.shape)]
     return [
         dict(zip(names, (*number, "; ".join(filter(None, (note, *doubts)))), strict=True)) for *number, note in found
     ]
+
+
+def doubts_of(summary: "Summary") -> list[str]:
+    """Beginnings of the notes that concern every number."""
+    return [doubt for doubt in DOUBTS if any(note.startswith(doubt) for note in summary.notes)]
 
 
 def below(summary: "Summary") -> list[str]:
