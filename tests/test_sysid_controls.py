@@ -89,6 +89,7 @@ def test_what_pushes_is_not_taken_for_contact():
 @pytest.mark.parametrize(
     "changed, message",
     [
+        ({"pushes": np.zeros(30)}, r"no column 'pushes' in .*did you mean 'push'"),
         ({"push": None}, r"observations has no column 'push', which a force takes as its control: give zeros"),
         ({"push": (CHANGES + 0.01, PUSHES)}, r"observations\['push'\] begins at 0.01 s, after the start 0 s"),
         ({"push": (CHANGES, PUSHES * np.nan)}, r"observations\['push'\] has NaN: expected numbers"),

@@ -258,6 +258,10 @@ def test_a_fit_that_is_none_says_so(records, column):
     data = {"t": r["t"], column: 1e3 * (r["p.x"] if column == "p.x" else r["p.x"][:, 1])}
     found = dr.fit(*point(), data, free={"gravity[1]": dr.interval(-20, 20)}, progress=False)
     assert found.notes[0].startswith("the fit failed: residuals of p.x are as large")
+    assert found.notes[0].endswith("no two shapes of this scene can meet: does it lack a floor?")
+    g = found.derived(lambda world, _: dr.paths.read(world, None, "gravity")[1])
+    assert g.note == "the fit failed; residuals are autocorrelated"  # also where it stands alone
+    assert found.rows()[0]["note"] == f"at its bound; {g.note}"
     again = found.with_intervals(sysid.from_jacobian)
     assert again.notes == found.notes
 
@@ -317,6 +321,9 @@ def test_a_saved_fit_is_read_back_and_resumed(fit, records, tmp_path):
     assert {"diffrigid", "jax", "numpy"} <= set(json.loads((tmp_path / "fit.json").read_text())["versions"])
     again = dr.fit(*point(), records, free=FREE, progress=False, resume=saved, iterations=1)
     assert_allclose(again["p.x"].value, fit["p.x"].value, atol=1e-6)
+    more = sysid.make_problem(*point(), [*records, records[0]], free=FREE, resume=saved)  # the last begins anew
+    assert_allclose(more.runs[0].state.x, fit.scenes[0].state.x)
+    assert_allclose(more.runs[-1].state.x, records[0].state.x)
     with pytest.raises(ValueError, match="resume is a fit of .*p.x.*: expected one of some of what is free here"):
         dr.fit(*point(), records, free={"p.mass": dr.positive()}, progress=False, resume=saved)
     for use in (lambda fit: dr.profile(fit, "gravity"), dr.sample, sysid.jumps):

@@ -12,6 +12,7 @@ import numpy as np
 
 from diffrigid import joint_motion
 from diffrigid.catalogue import component
+from diffrigid.controls import controlled
 from diffrigid.convert import nearest, numbers, unit_quaternion
 from diffrigid.pytree import array_fields, letters_of, replace
 from diffrigid.state import State, axis_sizes
@@ -132,7 +133,8 @@ def _by_name(name: str, what: str, world: World) -> Any:
         raise ValueError(
             f"observations: no column {name!r} in this {world.dim}D world"
             + ("" if name == what else f", which observes {what!r}")
-            + f": say what it observes by observe={{{name!r}: ...}}, None leaves it out; {_hint(what, possible)}"
+            + f": say what it observes by observe={{{name!r}: ...}}, None leaves it out; "
+            + _hint(what, [*possible, *controlled(world.forces)])
         )
     return possible[wanted]
 

@@ -202,7 +202,7 @@ def doubts(series: Sequence[np.ndarray], robust: bool = False) -> list[str]:
     if (p := whiteness(series)) < RARE:
         out.append(
             f"residuals are autocorrelated (p = {p:.1g}), so intervals are too narrow: the model misses something, or "
-            "the fit is in a local minimum (compare starts=16)"
+            "the fit is in a local minimum (compare starts=16, or windows that end between impacts)"
         )
     joined = np.concatenate([np.zeros(0), *(r[np.isfinite(r)] for r in series)])
     if not robust and (p := normality(joined)) < RARE:
