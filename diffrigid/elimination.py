@@ -9,7 +9,7 @@ The matrix is positive semidefinite, so no pivoting is needed. Where joints form
 its pivot is rounding, by which nothing can be divided. So a little is added to the diagonal there, much more than
 rounding, and the solution refined: it is then one of many, and finite. Where joints form a tree there is none.
 Source: George & Liu, Computer Solution of Large Sparse Positive Definite Systems, 1981, chapters 4 and 5;
-for what is added Riley 1955, Solving systems of linear equations with a positive definite, but ill-conditioned matrix;
+for what is added to the diagonal Riley, Mathematical Tables and Other Aids to Computation 9 (1955) 96;
 for every second joint of a chain Hockney 1965 (cyclic reduction); for joints Baraff, Linear-time dynamics using
 Lagrange multipliers, SIGGRAPH 1996.
 """
