@@ -288,6 +288,8 @@ def test_bad_input_of_a_fit(data, arguments, message):
         ({"cue.mass": dr.positive(), "restitution": dr.real(), "cue.restitution": dr.real()}, "set the same number"),
         ({"cue.q": dr.rotation(), "cue.angle": dr.real()}, "set the same number"),
         ({"cue.v[0]": dr.real(), "cue.v": dr.real()}, "set the same number"),
+        ({"cue.mass": dr.through(dr.paths.write, dr.real(), 1.0)}, "expected a name of its own"),
+        ({("a", "b"): dr.through(dr.paths.write, dr.real(), 1.0)}, "expected a name of its own"),
         ({"cue.v[2]": dr.real()}, r"cue.v\[2\] is not a number"),
         ({"contact.width": dr.positive()}, "the widths to go through"),
         ({"ball.v": dr.direction()}, "a direction that is not zero"),
@@ -300,6 +302,8 @@ def test_bad_parameters_of_a_fit(free, message):
         dr.fit(WORLD, STATE, GOOD, free=free, progress=False)
     with pytest.raises(ValueError, match="deviation"):
         dr.prior(dr.real(), 0.0, 0.0)
+    with pytest.raises(ValueError, match="unit is 1.0, expected a string"):
+        dr.through(dr.paths.write, dr.real(), 0.0, 1.0)
 
 
 def test_a_component_of_a_vector_is_free_alone():
