@@ -285,7 +285,10 @@ def test_bad_input_of_a_fit(data, arguments, message):
         ({"cue.x": dr.direction(), "cue.mass": dr.direction()}, "expected a vector"),
         ({("cue.mass",): dr.shares()}, "two or more"),
         ({"cue.x": dr.each(3)}, "expected interval"),
-        ({"cue.mass": dr.positive(), "restitution": dr.real(), "cue.restitution": dr.real()}, "set the same number"),
+        (
+            {"cue.mass": dr.positive(), "restitution": dr.real(), "cue.restitution": dr.real()},
+            "set the same number: leave one out, or free restitution by bodies and statics only",
+        ),
         ({"cue.q": dr.rotation(), "cue.angle": dr.real()}, "set the same number"),
         ({"cue.v[0]": dr.real(), "cue.v": dr.real()}, "set the same number"),
         ({"cue.mass": dr.through(dr.paths.write, dr.real(), 1.0)}, "expected a name of its own"),
@@ -302,6 +305,8 @@ def test_bad_parameters_of_a_fit(free, message):
         dr.fit(WORLD, STATE, GOOD, free=free, progress=False)
     with pytest.raises(ValueError, match="deviation"):
         dr.prior(dr.real(), 0.0, 0.0)
+    with pytest.raises(ValueError, match="cue.mass is -1: expected above 0"):
+        dr.fit(*dr.paths.write(WORLD, STATE, "cue.mass", -1.0), GOOD, free={"cue.v": dr.real()}, progress=False)
     with pytest.raises(ValueError, match="unit is 1.0, expected a string"):
         dr.through(dr.paths.write, dr.real(), 0.0, 1.0)
 

@@ -293,6 +293,7 @@ def test_degrees_in_a_column_of_angles_are_noticed_and_so_is_data_without_noise(
         *dr.scene({"wheel": wheel}), {"t": t, "wheel.angle": np.degrees(2.0 * t)}, free={"wheel.w": dr.real()}
     )
     assert found.notes[0].startswith("the fit failed") and "degrees" in found.notes[0]
+    assert "no two shapes of this scene can meet" in found.notes[0] and "it has no gravity" in found.notes[0]
     measured, free = {"t": t, "wheel.angle": 2.0 * t}, {"wheel.w": dr.real()}
     exact = dr.fit(*dr.scene({"wheel": wheel}), measured, free=free)
     (note,) = exact.notes  # rounding is neither white nor normal, which says nothing of the model

@@ -205,14 +205,16 @@ def through(
     """A number of your own that sets several of the scene: {"length": through(lengthen, positive(), 0.8, "m")}.
 
     Args:
-        write: (world, state, value) -> (world, state) with the value written in, by `dr.paths.write`, which JAX can
-            trace. It comes after the other free numbers, but before densities and the coordinates of joints.
+        write: (world, state, value) -> (world, state) of one record, with the value, of the shape of `start`, written
+            in by `dr.paths.write`. JAX traces and differentiates it, so it has to be smooth where a fit may go. It
+            comes after the other free numbers, but before densities and the coordinates of joints.
         kind: `positive()`, `interval(low, high)` or another.
-        start: the value to begin with, a number or a vector.
+        start: the value to begin with, () or (k,), in the unit that `write` takes.
         unit: of the table.
 
     Raises:
-        ValueError: write is no function, start not numbers, unit no string.
+        ValueError: write is no function, start not numbers, unit no string. In `fit`: the name is that of a parameter,
+            or write returns other arrays.
 
     Example:
         >>> def lengthen(world, state, length):  # a thin rod
