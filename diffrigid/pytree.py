@@ -26,9 +26,9 @@ Vector = Sequence[float] | np.ndarray | jax.Array
 Record = TypeVar("Record")
 
 
-def array(*letters: Any, default: Any = dataclasses.MISSING) -> Any:
+def array(*letters: Any, default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:
     """Field for a float array whose axes, for one world, are named by `letters` (none: a number)."""
-    return dataclasses.field(default=default, metadata={"letters": letters}, kw_only=True)
+    return dataclasses.field(default=default, metadata={"letters": letters}, kw_only=kw_only)
 
 
 def static(default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:

@@ -35,7 +35,7 @@ class Disc:
         0.1
     """
 
-    radius: Leaf = array()  # (*batch) [m] > 0
+    radius: Leaf = array(kw_only=False)  # (*batch) [m] > 0
 
 
 @pytree
@@ -48,7 +48,7 @@ class Sphere:
         [0.004, 0.004, 0.004]
     """
 
-    radius: Leaf = array()  # (*batch) [m] > 0
+    radius: Leaf = array(kw_only=False)  # (*batch) [m] > 0
 
 
 @pytree

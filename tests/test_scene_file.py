@@ -166,10 +166,15 @@ def test_fit_from_the_command_line(tmp_path):
     )
     lines = [f"{1e3 * t:.3f},0.0,{1 - 9.81 * t**2 / 2:.9f},free" for t in np.arange(12) / 20]
     (tmp_path / "fall.csv").write_text("\n".join(["time,x,p.x[1],note", *lines]) + "\n")
+    lines = [f"{1e3 * t:.3f},2.0,{4 - 9.81 * t**2 / 2:.9f},free" for t in np.arange(12) / 20]
+    (tmp_path / "risen.csv").write_text("\n".join(["time,x,p.x[1],note", *lines]) + "\n")
     files, said = [str(tmp_path / name) for name in ("scene.toml", "fall.csv")], io.StringIO()
     with contextlib.redirect_stdout(said):
         assert main(["fit", *files, "--out", str(tmp_path / "fit.json"), "--report", str(tmp_path / "fit.html")]) == 0
+        with pytest.warns(UserWarning, match="record 0 began at the fitted start"):  # 2 m to the right, 3 m higher
+            assert main(["fit", *files, "--held-out", str(tmp_path / "risen.csv")]) == 0
     assert "gravity[1]" in said.getvalue()
+    assert "held out: root mean square of p.x 2.55 (" in said.getvalue()
     saved = dr.load_fit(tmp_path / "fit.json")
     assert_allclose(saved["gravity"].value, (0.0, -9.81), atol=1e-6)
     assert "scene: fall.csv" in (tmp_path / "fit.html").read_text(encoding="utf-8")

@@ -105,7 +105,7 @@ def test_records_of_two_classes_are_never_alike():
 
 def test_records_are_not_compared_while_their_numbers_are_unknown():
     disc = Disc(radius=1.0)
-    assert disc == Disc(radius=1.0) and disc != Disc(radius=2.0) and disc != Sphere(radius=1.0)
+    assert disc == Disc(1.0) and disc != Disc(radius=2.0) and disc != Sphere(1.0)
     for trace in (jax.jit, jax.grad):
         with pytest.raises(TypeError, match="not known while JAX traces"):
             trace(lambda radius: 1.0 * (Disc(radius=radius) == disc))(1.0)

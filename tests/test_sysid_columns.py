@@ -229,6 +229,24 @@ def test_velocities_in_another_unit_are_doubted_and_fast_vibrations_fitted():
         problem({"t": t, "cue.x": x, "cue.v": v})
 
 
+def test_marks_for_lost_points_are_doubted():
+    """A tracker writes (0, 0) or (-1, -1) where it sees nothing; what rests at the origin, or crosses it, is there."""
+    t = np.arange(40) / 60
+    x = np.outer(t, (3.0, 1.0)) + (1.0, 2.0)
+    problem = partial(make_problem, WORLD, STATE, free={"ball.v": dr.real()})
+    for mark in (0.0, -1.0):
+        lost = np.where((np.arange(40) % 10 == 3)[:, None], mark, x)
+        with pytest.warns(UserWarning, match=rf"\['ball.x'\] is {mark:g} in 4 rows, far from the rows beside"):
+            problem({"t": t, "ball.x": lost})
+        with pytest.warns(UserWarning, match=rf"\['tip'\] is {mark:g} in 4 rows.*make it NaN"):
+            problem({"t": t, "tip": lost}, observe={"tip": dr.Marker("ball")})
+    slides = np.maximum(0.5 - t, 0.0)
+    problem(
+        {"t": t, "ball.x": np.stack([slides, 0.0 * t], axis=1), "ball.v": np.where(slides, -1.0, 0.0)[:, None] * (1, 0)}
+    )
+    problem({"t": t, "ball.x": x - x[20]})
+
+
 def test_columns_may_have_times_of_their_own():
     slow = T[::2] + 0.03
     series, *_ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})

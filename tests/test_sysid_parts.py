@@ -253,6 +253,15 @@ def test_what_is_seen_of_an_inertia_has_an_interval():
     sizes = np.array([3.0, 1.0])  # second moments along axes 1 and 3: their sum is the inertia about axis 2
     assert_allclose(wide[1, 1], 2 * 2.0 * 1e-2 * np.sqrt((sizes**2).sum()), rtol=1e-6)
     assert_allclose(wide[0, 1], 0.0, atol=1e-12)
+    names = [row[0] for row in rows_of(Parameter("die.inertia", value, low, high, "kg m^2", ""))]
+    assert names == [f"die.inertia[{k}, {k}]" for k in range(3)]
+
+
+def test_a_symmetric_matrix_is_in_the_table_once():
+    values = np.stack([np.full((3, 3), 0.1) + np.eye(3)] * 2)
+    rows = rows_of(Parameter("die.inertia", values, values, values, "kg m^2", "", 2))
+    upper = ("0, 0", "0, 1", "0, 2", "1, 1", "1, 2", "2, 2")
+    assert [row[0] for row in rows] == [f"die.inertia{{{k}}}[{part}]" for k in range(2) for part in upper]
 
 
 def test_numbers_have_the_names_of_the_table():

@@ -12,9 +12,11 @@ from diffrigid.catalogue import component
 from diffrigid.controls import controlled
 from diffrigid.convert import nearest
 from diffrigid.sysid.channels import channel_of
-from diffrigid.sysid.sensors import Channel, Part
+from diffrigid.sysid.sensors import Channel, Homography, Marker, Part, Pinhole
 from diffrigid.world import World
 
+MARKS = (0.0, -1.0)  # what trackers write where they have lost a point
+FAR = 20.0  # [-] times the usual way between rows: marks that are farther from the rows beside them are reported
 SPEED_RATIO = 20.0  # [-] speeds that differ by more than this factor from those of the positions have another unit
 
 
@@ -247,6 +249,28 @@ def odd_speeds(found: Sequence[Series], channels: Mapping[str, Channel]) -> str:
                     f"[{name!r}]: speeds of about {speeds:.3g}, but {parts[body, 'x']!r} moves at {far:.3g} a second: "
                     "are both in metres and seconds? If so, it is a motion faster than its rows show"
                 )
+    return ""
+
+
+def odd_places(found: Sequence[Series], channels: Mapping[str, Channel]) -> str:
+    """Say which column of places has rows that hold one of `MARKS` far from those beside them; "" if none has."""
+    for series in found:
+        observer = channels[series.name].observer
+        if not isinstance(observer, Marker | Homography | Pinhole) and getattr(observer, "field", "") != "x":
+            continue
+        known = np.isfinite(series.values).all(1)
+        t, values = series.t[known], series.values[known]
+        for mark in MARKS:
+            marked = (values == mark).all(1)
+            if marked.any() and (~marked).sum() > 1:
+                rest = values[~marked]
+                beside = np.stack([np.interp(t[marked], t[~marked], column) for column in rest.T], axis=1)
+                way = FAR * _median_size(np.diff(rest, axis=0))
+                if many := int((np.linalg.norm(beside - mark, axis=1) > way).sum()):
+                    return (
+                        f"[{series.name!r}] is {mark:g} in {many} row{'s' * (many > 1)}, far from the rows beside: if "
+                        "it is not measured there, make it NaN"
+                    )
     return ""
 
 

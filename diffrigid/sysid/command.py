@@ -8,6 +8,7 @@ from typing import Any
 from diffrigid import scene_file
 from diffrigid.sysid.columns import read_csv
 from diffrigid.sysid.fit import fit
+from diffrigid.sysid.result import Fit
 from diffrigid.sysid.summary import load_fit
 
 
@@ -19,27 +20,42 @@ def main(arguments: Sequence[str]) -> int:
     )  # fmt: skip
     parser.add_argument("scene", help="TOML file, as below")
     parser.add_argument("data", nargs="+", help="CSV files: columns t, ball.x[0], ball.x[1], ball.angle, ...")
+    parser.add_argument("--held-out", metavar="FILE", nargs="+", help="score the fit on records that it did not see")
     parser.add_argument("--out", metavar="FILE", help="write the result as JSON")
     parser.add_argument("--report", metavar="FILE", help="write a page for the browser")
     parser.add_argument("--resume", metavar="FILE", help="start from a result")
     options = parser.parse_args(arguments)
     try:
         read = scene_file.read_scene(options.scene)
-        records = [_record(path, read.columns) for path in options.data]
+        records, held_out = (
+            [_record(path, read.columns) for path in paths or ()] for paths in (options.data, options.held_out)
+        )
         observations = records if len(records) > 1 else records[0]
         resume = None if options.resume is None else load_fit(options.resume)
         found = fit(
             read.world, read.state, observations, free=read.free, observe=read.observe, resume=resume, **read.options
         )  # fmt: skip
+        print(found)
+        if options.out:
+            print(f"written to {found.save(options.out)}")
+        if options.report:
+            title = f"{Path(options.scene).stem}: {', '.join(Path(name).name for name in options.data)}"
+            print(f"report: {found.report(options.report, title)}")
+        if held_out:
+            print(_scored(found, held_out))
     except (ValueError, OSError) as error:
         parser.exit(2, f"{parser.prog}: {error}\n")
-    print(found)
-    if options.out:
-        print(f"written to {found.save(options.out)}")
-    if options.report:
-        title = f"{Path(options.scene).stem}: {', '.join(Path(name).name for name in options.data)}"
-        print(f"report: {found.report(options.report, title)}")
     return 0
+
+
+def _scored(found: Fit, records: Sequence[Any]) -> str:
+    """Root mean square of the residuals of records that were held out, beside the noise of the fit."""
+    sizes = [
+        f"{name} {size:.3g} ({size / found.noise[name]:.2g} times the noise)" if name in found.noise else
+        f"{name} {size:.3g}"
+        for name, size in found.score(records).items()
+    ]  # fmt: skip
+    return f"held out: root mean square of {', '.join(sizes)}"
 
 
 def _record(path: str, columns: Mapping[str, tuple[str, float]]) -> Any:

@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from diffrigid.sysid.covariance import Intervals, Linear, check_intervals, from_
 from diffrigid.sysid.free import Each, Free, Prior, Through
 from diffrigid.sysid.intervals import describe
 from diffrigid.sysid.lead_in import better, growing, is_suspect
-from diffrigid.sysid.levenberg import INTERRUPTED, Numbers, Point, Report, cost_of, levenberg, point_at
+from diffrigid.sysid.levenberg import INTERRUPTED, Numbers, Point, cost_of, levenberg, point_at
 from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.noise import all_noise, estimated_noise, rescaled
 from diffrigid.sysid.orders import impact_orders
@@ -29,6 +30,7 @@ from diffrigid.world import World
 
 SQUARES = Squares()
 NOT_SMALL = 0.1  # [-] of the spread of a column: larger residuals that are not noise are named before a blind parameter
+LINE = 80  # characters of a line of progress, so that one covers the one before
 AGREES, AGREES_RELATIVE = 0.5, 1e-3  # of the loss, and of the best: a start within their sum agrees with the best
 
 
@@ -118,7 +120,7 @@ def fit(
     def through(problem: Problem, z: Numbers, stages: Sequence[tuple[float, float]]) -> tuple[Problem, Point, str]:
         for width, window in stages:
             problem = with_noise(problem, problem.noise, window, width)
-            point, early = solve(problem.groups, z, loss, iterations, reach, report)
+            point, early = solve(problem.groups, z, loss, iterations, reach, partial(report, _stage(width, window)))
             z = point.z
             if early == INTERRUPTED:
                 break
@@ -133,7 +135,7 @@ def fit(
     if early != INTERRUPTED and (problem.noise or leads_in):  # with the estimate of the noise from the residuals
         problem = with_noise(problem, estimated_noise(problem, point, loss))
         problem, point, early = through(problem, point.z, stages[-1:])
-    report(-1, np.asarray(cost_of(loss, point.residuals)))
+    report("", -1, np.asarray(cost_of(loss, point.residuals)))
     return finish(problem, point, loss, intervals, seed, began, [early] if early else [])
 
 
@@ -228,15 +230,22 @@ def _seen(problem: Problem, linear: Linear) -> dict[str, bool]:
     return {slot.name: bool(np.any(sizes[rows] > 0)) for slot, rows in pieces(problem.slots)}
 
 
-def _printer(progress: bool | None, starts: int) -> Report:
-    """Make a function that prints the iteration and the best cost, over one line."""
+def _stage(width: float, window: float) -> str:
+    """What a stage of a fit is of, for the line of progress."""
+    wide, long = f", {width:.3g} m wide", f", the first {window:.3g} s"
+    return (wide if width > 0 else "") + (long if window < np.inf else "")
+
+
+def _printer(progress: bool | None, starts: int) -> Callable[[str, int, np.ndarray], None]:
+    """Make a function that prints the iteration of a stage and the best cost, over one line."""
     if progress is None:
         progress = sys.stdout.isatty() or "ipykernel" in sys.modules
 
-    def report(count: int, costs: np.ndarray) -> None:
+    def report(stage: str, count: int, costs: np.ndarray) -> None:
         if progress:
             end = "\n" if count < 0 else "\r"
-            label = "done" if count < 0 else f"iteration {count:3d}"
-            print(f"fit: {label}, {starts} starts, best cost {float(np.min(costs)):.6g}      ", end=end, flush=True)
+            label = "done" if count < 0 else f"iteration {count:3d}{stage}"
+            line = f"fit: {label}, {starts} starts, best cost {float(np.min(costs)):.6g}"
+            print(f"{line:<{LINE}}", end=end, flush=True)
 
     return report

@@ -10,7 +10,7 @@ import numpy as np
 from diffrigid.controls import controlled
 from diffrigid.convert import known_number, positive
 from diffrigid.state import State
-from diffrigid.sysid.columns import Series, check_mapping, columns, odd_speeds
+from diffrigid.sysid.columns import Series, check_mapping, columns, odd_places, odd_speeds
 from diffrigid.sysid.free import as_given
 from diffrigid.sysid.sensors import Channel
 from diffrigid.tables import moment
@@ -85,7 +85,7 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
     found = [
         _run(world, state, record, observe, noise or {}, part) for record, part in zip(records, where, strict=True)
     ]
-    odd = [odd_speeds(run.series, run.channels) for run in found]
+    odd = [odd_places(run.series, run.channels) or odd_speeds(run.series, run.channels) for run in found]
     if any(odd):
         warnings.warn(next(part + text for part, text in zip(where, odd, strict=True) if text), stacklevel=4)
     everywhere = sorted({s.name for run in found for s in run.series})

@@ -15,6 +15,7 @@ HEADER = ("parameter", "value", "95 % interval", "unit", "")
 BLIND = "not determined, see below"  # note of a parameter with a number that has no interval
 STICKS = "larger values fit as well, see below"  # likewise of a friction that ended where what slipped sticks
 ENDED = " ended where what slips begins to stick"  # behind its name, the beginning of the remark on it
+ZERO = 1e-6  # [-] of an inertia: what is smaller, with its interval, is rounding
 BOUND = "at its bound"  # note of a parameter that ended there
 # Beginnings of notes that concern every number.
 DOUBTS = ("the fit failed", "not converged", "the cost jumps", "residuals are autocorrelated")
@@ -31,7 +32,7 @@ def rows_of(p: Any) -> list[tuple[str, ...]]:
     out: list[tuple[str, ...]] = []
     shown = p.records if p.records <= TABLE_RECORDS + 1 else TABLE_RECORDS  # a line that hides one record saves none
     for index in np.ndindex(p.value.shape):
-        if p.records and index[0] >= shown:
+        if (p.records and index[0] >= shown) or _says_nothing(p, index):
             continue
         name, value, low, high, unit, note = _number(p, index)
         places = digits(value, low, high, 3)
@@ -40,6 +41,14 @@ def rows_of(p: Any) -> list[tuple[str, ...]]:
     if p.records > shown:
         out.append((p.name, "...", "", "", f"and {p.records - shown} more records"))
     return out
+
+
+def _says_nothing(p: Any, index: tuple[int, ...]) -> bool:
+    """Whether a number of an inertia repeats another, the matrix being symmetric, or is a zero between its axes."""
+    if not p.name.endswith(".inertia") or p.value.ndim < 2:
+        return False
+    row, column = index[-2:]
+    return row > column or bool(np.max(np.abs([p.value[index], p.low[index], p.high[index]])) < ZERO * p.value.max())
 
 
 def _number(p: Any, index: tuple[int, ...]) -> tuple[str, float, float, float, str, str]:
