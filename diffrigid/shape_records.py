@@ -17,6 +17,8 @@ from diffrigid.shapes import HeightField, Hull, Polygon, traced
 from diffrigid.state import rotations
 from diffrigid.world import Offset
 
+MOST_CELLS = 256  # to each side: of more, the nodes alone fill gigabytes
+
 
 def looking_around(pieces: Mapping[str, tuple[Piece, ...]], moving: Iterable[str]) -> dict[str, tuple[Piece, ...]]:
     """Height fields with `cells` filled in: how far to each side the bodies look."""
@@ -32,9 +34,16 @@ def looking_around(pieces: Mapping[str, tuple[Piece, ...]], moving: Iterable[str
                 f"{name}.shape.spacing or the size of a body is traced, so how far it looks around cannot be found: "
                 "give the HeightField cells=..., above the largest size of a body over the spacing by 1"
             )
+        if not traced(parts) and (cells := float(max(parts, default=1))) > MOST_CELLS:
+            raise ValueError(
+                f"{name}.shape.spacing is {float(shape.spacing):g} m, so that a body reaches over {cells:.3g} cells to "
+                f"each side: expected {MOST_CELLS} at most; leave out nodes between others"
+            )
         least = None if traced(parts) else int(max(parts, default=1))
         if shape.cells is not None and least is not None and shape.cells < least:
             raise ValueError(f"{name}.shape.cells is {shape.cells}: expected {least} or more, or leave it out")
+        if shape.cells is not None and shape.cells > MOST_CELLS:
+            raise ValueError(f"{name}.shape.cells is {shape.cells}: expected {MOST_CELLS} at most, or leave it out")
         found[name] = (Piece("", replace(shape, cells=least if shape.cells is None else shape.cells)),)
     return found
 

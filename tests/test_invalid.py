@@ -117,11 +117,11 @@ SHAPES = {
     ),
     "HeightField.spacing": (
         lambda v: deep(others={"ground": dr.Static(dr.HeightField(heights=np.eye(3), spacing=v))}),
-        (*POSITIVE, None),
+        (*POSITIVE, None, 1e-3, 1e-320),
     ),
     "HeightField.cells": (
         lambda v: deep(others={"ground": dr.Static(dr.HeightField(heights=np.eye(3), spacing=0.5, cells=v))}),
-        tuple(v for v in optional(INTEGER) if v is not HUGE),
+        (*optional(INTEGER), 257),
     ),
     "Body.shape": (lambda v: dr.scene({"ball": dr.Body(v, mass=1.0, x=(0.0, 0.0))}), (*RECORD, None)),
     "Static.shape": (lambda v: flat(others={"floor": dr.Static(v)}), (*RECORD, None)),
