@@ -7,10 +7,12 @@ attributes let the step skip work, and all default to the general case when abse
     uniform    every body has the same constant acceleration, so that relative paths are straight
     twists     the wrench has a torque
 
-A `planar` one is for 2D only. One that depends on the length of the step has `within`, see `GroundFriction`. Below 0,
-fields that `resist` motion are refused.
+One between two bodies has their names in the fields a and b; one of each body on all others is `mutual`, a fourth class
+attribute: where one is struck, its partners fly on from that time too. A `planar` one is for 2D only. One that depends
+on the length of the step has `within`, see `GroundFriction`. Below 0, fields that `resist` motion are refused.
 """
 
+import itertools
 from typing import Any, ClassVar
 
 import jax
@@ -50,6 +52,9 @@ class Drag:
 
     The linear part is viscous drag; the quadratic one that of air on what is thrown, rho c A / 2 of a ball.
 
+    A linear part that is the same along all axes is one number of a fit by a tuple of its components: in 2D
+    free={("drag.linear[0]", "drag.linear[1]"): dr.positive()}; "drag.linear" is one number for each axis.
+
     Example:
         >>> puck = dr.Body(dr.Disc(radius=0.1), mass=2.0, x=(0.0, 0.0), v=(1.0, 0.0))
         >>> made, start = dr.scene({"puck": puck}, forces=[dr.Drag(linear=0.5)])
@@ -57,7 +62,7 @@ class Drag:
         (0.7788, 0.7788)
     """
 
-    linear: Leaf = array("D", default=0.0)  # (D, *batch) [N s/m]; a number stands for all directions
+    linear: Leaf = array("D", default=0.0)  # (D, *batch) [N s/m] by axis; a number is for all, and fitted as a tuple
     angular: Leaf = array(default=0.0)  # (*batch) [N m s/rad]
     quadratic: Leaf = array(default=None)  # (*batch) [N s^2/m^2]; None: none
     resist: ClassVar[tuple[str, ...]] = ("linear", "angular", "quadratic")
@@ -235,6 +240,18 @@ class SpringDamper:
         if body is None:
             return anchor + jnp.zeros_like(state.x[0]), jnp.zeros_like(state.v[0])
         return material_point(state, body, anchor), material_velocity(state, body, anchor)
+
+
+def ties(forces: tuple, moving: int) -> list[tuple[int, int]]:
+    """Pairs of bodies whose forces depend on the motion of both."""
+    pairs = []
+    for force in forces:
+        a, b = getattr(force, "a", None), getattr(force, "b", None)
+        if a is not None and b is not None:
+            pairs.append((a, b))
+        if getattr(force, "mutual", False):
+            pairs += list(itertools.pairwise(range(moving)))
+    return pairs
 
 
 def is_constant(forces: tuple) -> bool:

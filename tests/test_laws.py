@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid import so3
+from diffrigid.pytree import Leaf, array, pytree
 
 ROUNDING = 1e-12  # relative: sums of some hundred terms
 PUSHED = 3e-6  # relative energy: what a side that turns presses is held by an even force, whose error falls as dt^3
@@ -461,6 +462,55 @@ def test_two_walls_struck_at_once_need_not_be():
     world, state = dr.scene({"disc": disc, **walls}, restitution=e)
     slopes = jax.jit(jax.jacfwd(lambda x: dr.step(world, dr.replace(state, x=x), 1 / 60).x))(state.x)
     assert_allclose(slopes.reshape(2, 2), -e * np.eye(2), atol=ROUNDING)
+
+
+@pytree
+class Follow:
+    """Each body is pulled towards the velocity of the others: F_i = -damping sum_j (v_i - v_j)."""
+
+    damping: Leaf = array()
+    mutual = True
+
+    def __call__(self, bodies, state, controls):
+        return dr.Wrench(F=self.damping * (state.v.sum(0, keepdims=True) - len(bodies.mass) * state.v))
+
+
+@pytest.mark.parametrize("mutual", [False, True])
+def test_what_is_tied_to_a_struck_body_feels_it_from_the_time_of_the_impact(mutual):
+    """A puck strikes a disc to which a damper ties another. Their relative speed u falls as exp(-c t / mass).
+
+    By a mutual force the puck is slowed before the impact already, and all three share one speed in the end.
+    """
+    m, e, c, end = jnp.array([0.4, 0.6, 0.9]), 0.8, 1.2, 0.5
+
+    def simulated(v):
+        places = {"puck": (-0.5, 0.0), "b": (0.0, 0.0), "c": (0.5, 0.0)}
+        bodies = {k: dr.Body(dr.Disc(radius=0.1), mass=m[i], x=x) for i, (k, x) in enumerate(places.items())}
+        bodies["puck"] = dr.replace(bodies["puck"], v=jnp.stack([v, 0.0 * v]))
+        rod = {"anchor_a": (0.0, 0.0), "anchor_b": (0.0, 0.0), "stiffness": 0.0, "damping": c, "length": 0.5}
+        tied = Follow(damping=c) if mutual else dr.SpringDamper("b", "c", **rod)
+        state = dr.rollout(*dr.scene(bodies, restitution=e, forces={"tie": tied}), dt=1 / 60, steps=30).state
+        return state.x[-1, :, 0], state.v[-1, :, 0]
+
+    def expected(v):
+        t = end - 0.3 / v  # since the impact
+        p = (1 + e) * v / (1 / m[0] + 1 / m[1])
+        v_puck, u, mean = v - p / m[0], p / m[1], p / (m[1] + m[2])
+        rate = c * (1 / m[1] + 1 / m[2])
+        left, way = jnp.exp(-rate * t), (1 - jnp.exp(-rate * t)) / rate
+        share = m[2] / (m[1] + m[2])  # of the relative speed that is b's
+        v_b, v_c = mean + share * u * left, mean - (1 - share) * u * left
+        x_b, x_c = mean * t + share * u * way, 0.5 + mean * t - (1 - share) * u * way
+        return jnp.stack([-0.2 + v_puck * t, x_b, x_c]), jnp.stack([v_puck, v_b, v_c])
+
+    v = jnp.asarray(1.7)
+    found, slopes = jax.jit(lambda v: jax.jvp(simulated, (v,), (jnp.ones_like(v),)))(v)
+    if mutual:
+        assert found[0][1] > 0.01  # it was struck
+        assert_allclose((m @ found[1], m @ slopes[1]), (m[0] * v, m[0]), rtol=ROUNDING)
+        return
+    right, right_slopes = jax.jvp(expected, (v,), (jnp.ones_like(v),))
+    jax.tree.map(partial(assert_allclose, rtol=1e-5), (found, slopes), (right, right_slopes))
 
 
 def test_touching_balls_struck_just_where_a_step_ends():

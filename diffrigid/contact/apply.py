@@ -14,13 +14,12 @@ from jax import Array, lax
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.known import Known, beside, loads, reversing
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
-from diffrigid.contact.order import Links, over_islands
+from diffrigid.contact.order import Links, companions, over_islands
 from diffrigid.contact.resting import Law, Strikes, are_alone, barely, solve_impulses
 from diffrigid.contact.rolling import beside_rolling, rolling_reversing, rolling_stops, with_rows
 from diffrigid.contact.slipping import drift_after, keeping_spin, stopping_early
 from diffrigid.contact.strikes import is_rolling
 from diffrigid.contact.sums import at_colliders, side_sum
-from diffrigid.elimination import islands
 from diffrigid.fence import at_hand
 from diffrigid.flight import Flight, angular_momentum, orientation, position, velocity
 from diffrigid.gathers import flags
@@ -60,7 +59,7 @@ def apply_impulses(
     moving, active, held = flight.t0.shape[0], strikes.active.astype(kick.dtype), strikes.held.astype(kick.dtype)
     each = jnp.stack([active, active * strikes.s, held], axis=1)
     own = side_sum(each, each, strikes.a, strikes.b, moving)
-    together = islands(ends_of(world.joints), moving)
+    together = companions(world)
     count, total, evenly = jnp.moveaxis(over_islands(jnp.sum, own, together, 0.0), 1, 0)
     t = jnp.where(count > 0, total / jnp.maximum(count, 1.0), flight.t0)
     holds = (kick > 0) & (evenly > 0)

@@ -6,15 +6,21 @@ once, because passed on from body to body it would never end. An elastic one is 
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrigid.branches import any_world
 from diffrigid.contact.sums import alike, at_colliders, body_sides
+from diffrigid.elimination import islands
+from diffrigid.forces import ties
 from diffrigid.gathers import rows
+from diffrigid.linkage import ends_of
 from diffrigid.pytree import array, pytree, replace
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 # Times no longer than eps ** SOON of a step need not be held. Else a gap of rounding, or in double precision the error
 # of the second time until which a contact is held, would take a sweep.
@@ -37,12 +43,21 @@ class Meeting:
     held: Any = array(default=None)  # bool: s is the time until which the resting contacts are held
 
 
+def companions(world: "World") -> tuple[tuple[int, ...], ...]:
+    """For each body, those whose paths begin at one time with its own, itself included. Static.
+
+    They are connected by joints, or by forces: of two bodies that are at different times no force is known.
+    """
+    moving = len(world.names)
+    return islands([*ends_of(world.joints), *ties(world.forces, moving)], moving)
+
+
 class Links(NamedTuple):
-    """Which bodies may act on each other: M links between two colliders, and N bodies connected by joints."""
+    """Which bodies may act on each other: M links between two colliders, and N bodies with their companions."""
 
     a: tuple[int, ...]  # colliders of each link: bodies, then statics
     b: tuple[int, ...]
-    islands: tuple[tuple[int, ...], ...]  # for each body, those connected with it by joints, itself included
+    islands: tuple[tuple[int, ...], ...]  # of each body, its `companions`
 
     def of_bodies(self, reduce: Callable, values: Array, none: Any) -> Array:
         """Reduce values (M, *batch) over the links of each body's island, (N, *batch); `none` if it has no links."""
@@ -62,7 +77,7 @@ def in_order(
 
     Args:
         meetings: of the links, M in all.
-        links: an impact reaches all bodies that are connected by joints.
+        links: an impact reaches all companions of a body.
         t0: (N, *batch) [s] where their paths begin.
         at_end: bool; True: all are at the end of the step.
         bounces: (M, *batch) bool: there is restitution between them. None: no bodies have to be held until an impact.

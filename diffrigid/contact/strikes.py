@@ -19,7 +19,7 @@ from diffrigid.contact.impulse import effective_matrix
 from diffrigid.contact.levers import acceleration, by_spin, levers, with_rates
 from diffrigid.contact.materials import material, mixed
 from diffrigid.contact.nearing import EXACT_BEYOND
-from diffrigid.contact.order import Links, Meeting, at_once, in_order
+from diffrigid.contact.order import Links, Meeting, at_once, companions, in_order
 from diffrigid.contact.resting import Strikes, are_alone
 from diffrigid.contact.sides import (
     Side,
@@ -77,7 +77,7 @@ def find_strikes(
         meetings.append(meet_stops(world, flight, since, dt, at_end))
     bounces = _coefficients(world, "restitution", a, b, dt.shape) > 0 if waits(world) else None
     a, b = a + stop_ends(world, "a"), b + stop_ends(world, "b")
-    links = Links(a, b, islands(ends_of(world.joints), len(world.names)))
+    links = Links(a, b, companions(world))
     meetings = in_order(meetings, links, flight.t0, dt, at_end, bounces)
     parts, jacs = [], {}
     for sides, meeting, own in zip(groups, meetings, rested, strict=False):
