@@ -1,5 +1,6 @@
 """From joints as users write them to the records of a `World`: names, values from the initial poses, and checks."""
 
+import dataclasses
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from diffrigid.state import State, rotations
 if TYPE_CHECKING:
     from diffrigid.world import World
 
+FROM_START = ("anchor_b", "axis_b", "q", "zero", "length")  # fields that are as at the start if they are left out
 SHORT = 4.0  # [1/m] times the arms of a joint: on short ones typed numbers are off by less
 
 
@@ -80,9 +82,11 @@ def _filled(name: str, joint: Any, colliders: list[str], x: Any, q: Any, dim: in
     filled = replace(joint, **given, **_from_start(so, fields, given, a, b), **ends)
     error = known(lambda joint, a, b: joint(so, a, b), filled, a, b)
     if not traced(error) and (np.abs(error) > _allowed(filled, so, a, b, joint.b is None, len(error))).any():
+        optional = [field.name for field in dataclasses.fields(joint) if field.default is None]
+        follow = [field for field in FROM_START if field in optional and field in given]
         raise ValueError(
             f"{name} does not hold at the start: it is off by {np.linalg.norm(error):.3g} (m, rad); move a body, or "
-            "leave out what belongs to b, which is then taken from the start"
+            f"leave out {' and '.join(follow)}, which the start then gives"
         )
     _check_drive(name, filled, so, a, b)
     return filled

@@ -598,7 +598,7 @@ def test_a_failed_fit_names_the_records_whose_beginning_nothing_showed():
         *point(), [dr.Record(seen), dr.Record(seen, state=point()[1]), dr.Record(seen)],
         free={"p.x": dr.each(dr.real())}, observe={"height": lambda state: 2.0 * state.x[0, 1:]},
     )  # fmt: skip
-    assert "; record 0, 2 began at the state of the scene" in failed(problem, [{"height": climb}] * 3)
+    assert "; record 0, 2 began at the state of the scene" in failed(problem, [{"height": climb}] * 3, False)
     with pytest.raises(ValueError, match="put a row of NaN there, and start= says so"):
         sysid.make_problem(*point(), {"t": [2.0], "p.x": [(0.0, 1.0)]}, free={"p.x": dr.real()})
 

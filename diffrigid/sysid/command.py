@@ -10,10 +10,14 @@ from diffrigid.sysid.columns import read_csv
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.summary import load_fit
+from diffrigid.sysid.table import FAILED
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Fit a scene to data, and print the table. Several files of data are records of one scene, fitted together."""
+    """Fit a scene to data, and print the table. Several files of data are records of one scene, fitted together.
+
+    The status is 0, 1 after a fit that failed, and 2 where something is wrong with the files.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m diffrigid fit", description=main.__doc__, epilog=scene_file.__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -45,7 +49,7 @@ def main(arguments: Sequence[str]) -> int:
             print(_scored(found, held_out))
     except (ValueError, OSError) as error:
         parser.exit(2, f"{parser.prog}: {error}\n")
-    return 0
+    return int(FAILED in found.doubts)
 
 
 def _scored(found: Fit, records: Sequence[Any]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from diffrigid.catalogue import component
 from diffrigid.convert import at_least_one, numbers
 from diffrigid.state import State
 from diffrigid.sysid.charts import Chart
@@ -178,9 +179,11 @@ def finish(
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         raise ValueError("fit: no start gives a finite motion: look at the values of the scene, or make dt smaller")
+    order, alike = np.argsort(costs), costs <= costs[best] + AGREES + AGREES_RELATIVE * costs[best]
+    orders = impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum()))
     linear = linear_of(problem, point, best, loss, bool(problem.noise))
-    in_units = by_column(problem, point, best, in_units=True)
-    _refuse_blind(problem, linear, in_units)
+    in_units, strikes = by_column(problem, point, best, in_units=True), any(orders[0])
+    _refuse_blind(problem, linear, in_units, strikes)
     shared, own = np.asarray(point.z.shared, float)[:, best], np.asarray(point.z.own, float)[..., best]
     uncertainty = intervals(linear)
     scenes = tuple(fitted_scenes(problem, shared, own))
@@ -188,14 +191,11 @@ def finish(
     stuck = sticking(problem, point, best, linear, uncertainty.covariance)
     if jump := beside_a_jump(problem, point, best, linear, loss):
         remarks = [*jump, *(remark for remark in remarks if remark == INTERRUPTED)]
-    remarks = [*remarks, *remarks_on(problem, scenes, in_units), *stuck]
+    remarks = [*remarks, *remarks_on(problem, scenes, in_units, strikes), *stuck]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss, remarks)
-    order, alike = np.argsort(costs), costs <= costs[best] + AGREES + AGREES_RELATIVE * costs[best]
     summary = Summary(
-        parameters=parameters, noise=all_noise(problem), costs=costs[order],
-        orders=impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum())),
-        agree=int(alike.sum()), notes=(*remarks, *notes), seed=seed,
-        seconds=time.time() - began, versions=versions(),
+        parameters=parameters, noise=all_noise(problem), costs=costs[order], orders=orders, agree=int(alike.sum()),
+        notes=(*remarks, *notes), seed=seed, seconds=time.time() - began, versions=versions(),
     )  # fmt: skip
     return Fit(
         summary, problem, scenes, shared, own, linear, uncertainty, residuals,
@@ -203,7 +203,7 @@ def finish(
     )  # fmt: skip
 
 
-def _refuse_blind(problem: Problem, linear: Linear, residuals: Sequence[dict[str, np.ndarray]]) -> None:
+def _refuse_blind(problem: Problem, linear: Linear, residuals: Sequence[dict[str, np.ndarray]], strikes: bool) -> None:
     """Raise ValueError for a parameter that no residual depends on, at the best fit and at the first start.
 
     Where the fit failed, that comes first: a motion far from the measured one says nothing about what is seen.
@@ -215,13 +215,24 @@ def _refuse_blind(problem: Problem, linear: Linear, residuals: Sequence[dict[str
     for slot in problem.slots:
         if not (seen[slot.name] or began[slot.name]):
             blind = f"nothing that was measured depends on {slot.name} at the best fit"
-            if failure := failed(problem, residuals, NOT_SMALL):
+            if failure := failed(problem, residuals, strikes, NOT_SMALL):
                 raise ValueError(f"{failure}. Besides, {blind}: begin it elsewhere")
-            raise ValueError(
-                f"free: {blind}: "
-                "leave it out, or give a record that shows it: an impact for restitution, one that slips for friction. "
-                "If there is one, begin closer: with less friction, so that it slips in the simulation too"
-            )
+            raise ValueError(f"free: {blind}: leave it out, or {_shown_by(slot.paths[0])}")
+
+
+def _shown_by(path: str) -> str:
+    """What a record needs to show a parameter."""
+    field = component(path)[0].rpartition(".")[2]
+    if field == "restitution":
+        return "give a record with an impact; if there is one, begin where the simulation has it too"
+    if field.endswith("friction"):
+        return (
+            "give a record in which something slips, or rolls; if it does, begin with less friction, so that it does "
+            "in the simulation too"
+        )
+    if field in ("mass", "density"):
+        return "give a record in which the body strikes, pushes or pulls one of known mass, or a known force acts on it"
+    return "give a record that shows it"
 
 
 def _seen(problem: Problem, linear: Linear) -> dict[str, bool]:

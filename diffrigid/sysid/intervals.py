@@ -29,13 +29,14 @@ from diffrigid.sysid.free import Free
 from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.noise import exact_columns
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
-from diffrigid.sysid.setup import Problem, first_value, scene_having, scene_of
+from diffrigid.sysid.setup import Problem, first_value, noise_guesses, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
-from diffrigid.sysid.table import BLIND, BOUND, ENDED, STICKS
+from diffrigid.sysid.table import BLIND, BOUND, ENDED, FAILED, STICKS
 from diffrigid.world import World
 
 UNSEEN = 1e-6  # [-] part of a slope along undetermined directions: more is not rounding
 FAINT = 0.1  # [-] of a deviation: residuals that are all smaller do not make intervals too narrow, white or not
+SCATTERED = 2.0  # [-] of the noise guessed from neighbouring rows: larger residuals, if no noise, are reported
 OUTSTANDING = 2.0  # [-] of the median of the records: larger residuals are reported, where residuals are no noise
 CLOSE = 0.95  # [-] correlation from which on two parameters are reported to go together
 
@@ -45,14 +46,23 @@ def describe(
     residuals: tuple[dict[str, np.ndarray], ...], loss: Loss, remarks: Sequence[str],
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """Parameters with intervals, and the notes under the table, besides the `remarks` on the fit as a whole."""
-    blind = blind_directions(linear, coordinates_of(problem))
+    lost = any(remark.startswith(FAILED) for remark in remarks)  # then slopes tell nothing of the measured motion
+    blind = [] if lost else blind_directions(linear, coordinates_of(problem))
     found = tuple(_parameters(problem, shared, own, linear, uncertainty, blind))
+    if lost:
+        return tuple(map(without_interval, found)), tuple(_doubts(problem, linear, residuals, loss))
     parameters = tuple(
         _sticks(p, slot) if any(r.startswith(p.name + ENDED) for r in remarks) else p
         for p, slot in zip(found, problem.slots, strict=True)
     )
     ended = [p.name for p in parameters if p.note == BOUND]
-    return parameters, tuple(_notes(problem, linear, uncertainty, blind, ended, residuals, loss))
+    notes = _notes(problem, linear, uncertainty, blind, ended)
+    return parameters, (*notes, *_doubts(problem, linear, residuals, loss))
+
+
+def without_interval(p: Parameter) -> Parameter:
+    """A number of a fit that failed, which may be anything."""
+    return replace(p, low=np.full_like(p.low, -np.inf), high=np.full_like(p.high, np.inf))
 
 
 def _parameters(
@@ -83,10 +93,9 @@ def _sticks(p: Parameter, slot: Slot) -> Parameter:
 
 
 def _notes(
-    problem: Problem, linear: Linear, uncertainty: Uncertainty, blind: Sequence[Blind], ended: Sequence[str],
-    residuals: tuple[dict[str, np.ndarray], ...], loss: Loss,
-) -> list[str]:  # fmt: skip
-    """What the data cannot determine, and why not to believe the intervals."""
+    problem: Problem, linear: Linear, uncertainty: Uncertainty, blind: Sequence[Blind], ended: Sequence[str]
+) -> list[str]:
+    """What the data cannot determine."""
     notes, places = [b.words for b in blind], coordinates_of(problem)[: linear.shared]
     if uncertainty.freedom < linear.shared:
         degrees = "1 degree" if round(uncertainty.freedom) == 1 else f"{uncertainty.freedom:.0f} degrees"
@@ -97,7 +106,12 @@ def _notes(
             f"{', '.join(ended)} ended at a bound, where the interval in the table says little: widen interval(low, "
             "high) if values beyond it are possible; if not, dr.profile gives an interval that ends there"
         )
-    notes += _together(uncertainty.covariance, places, blind)
+    return notes + _together(uncertainty.covariance, places, blind)
+
+
+def _doubts(problem: Problem, linear: Linear, residuals: tuple[dict[str, np.ndarray], ...], loss: Loss) -> list[str]:
+    """Why not to believe the intervals, as residuals show."""
+    notes = []
     if exact := exact_columns(problem):
         names = ", ".join(exact)
         notes.append(f"residuals of {names} are rounding, as for simulated data without noise: intervals mean nothing")
@@ -112,7 +126,15 @@ def _notes(
     columns = {name: r for name, parts in given.items() if len(r := np.concatenate(parts))}
     wrong = misjudged(columns, max(1.0 - lost / count, LEAST_FREE))  # then columns together are not normal in any case
     doubted = doubts(series, bool(wrong) or not isinstance(loss, Squares))
-    return notes + wrong + doubted + (_worst(residuals) if doubted else [])
+    return notes + wrong + doubted + [*_scattered(problem), *_worst(residuals)] * bool(doubted)
+
+
+def _scattered(problem: Problem) -> list[str]:
+    """Remark on columns whose residuals are much larger than what their neighbouring rows scatter."""
+    guesses = noise_guesses(problem.runs)
+    ratios = {name: sigma / guesses[name] for name, sigma in problem.noise.items()}
+    words = [f"{ratio:.2g} times in {name}" for name, ratio in ratios.items() if ratio > SCATTERED]
+    return [f"residuals are larger than neighbouring rows scatter: {', '.join(words)}"] if words else []
 
 
 def _worst(residuals: Sequence[dict[str, np.ndarray]]) -> list[str]:

@@ -28,7 +28,7 @@ from diffrigid.sysid.problem import full_turn
 from diffrigid.sysid.records import Run
 from diffrigid.sysid.sensors import JointPart
 from diffrigid.sysid.setup import Problem
-from diffrigid.sysid.table import ENDED
+from diffrigid.sysid.table import ENDED, FAILED
 from diffrigid.world import World, seats
 
 AS_LARGE = 0.5  # [-] of the spread of a column: larger residuals, if they are autocorrelated, mean that the fit failed
@@ -41,14 +41,17 @@ JUMPS = 2.0  # [-] a rise of the cost there: a jump
 TORN = 1e-3  # [m or rad] largest error of a joint at the fitted start without a remark
 
 
-def remarks_on(problem: Problem, scenes: Sequence[Scene], residuals: Sequence[dict[str, np.ndarray]]) -> list[str]:
+def remarks_on(
+    problem: Problem, scenes: Sequence[Scene], residuals: Sequence[dict[str, np.ndarray]], strikes: bool
+) -> list[str]:
     """Remarks on a fit, the worst first.
 
     Args:
         scenes: fitted, of every record.
         residuals: of every record by column, (K, size), in units of the column, NaN where missing.
+        strikes: whether anything strikes in the fitted motion.
     """
-    failure = failed(problem, residuals)
+    failure = failed(problem, residuals, strikes)
     out = [failure] if failure else []
     out += _torn(scenes[0]) + _light_inertia(problem, scenes[0])
     if np.isfinite(problem.window):
@@ -122,11 +125,11 @@ def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
 
-def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], least: float = AS_LARGE) -> str:
+def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], strikes: bool, least: float = AS_LARGE) -> str:
     """Say which residuals are so large that this is no fit; "" if none are.
 
     Args:
-        residuals: as in `remarks_on`.
+        residuals, strikes: as in `remarks_on`.
         least: [-] of the spread of a column, from which on residuals that are not noise are too large.
     """
     names = [
@@ -145,17 +148,19 @@ def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], least: 
             "scene, as the first rows do not show one: give a guess, dr.Record(..., state=first)"
         )
     return (
-        f"the fit failed: residuals of {', '.join(dict.fromkeys(names))} are {size} the motion; look at units (m, s, "
+        f"{FAILED}: residuals of {', '.join(dict.fromkeys(names))} are {size} the motion; look at units (m, s, "
         "rad; degrees need scale=180 / pi), at signs, and at the values to begin with, or try more starts; the start "
-        f"has to be free where it is not known{several}{''.join(_lacking(problem))}"
+        f"has to be free where it is not known{several}{''.join(_lacking(problem, strikes))}"
     )
 
 
-def _lacking(problem: Problem) -> Iterator[str]:
+def _lacking(problem: Problem, strikes: bool) -> Iterator[str]:
     """What the scene of a fit that failed may lack, or be given the other way round."""
     world, channels = problem.runs[0].world, problem.runs[0].channels
     if not (world.pairs or world.crowd):
         yield "; no two shapes of this scene can meet: does it lack a floor?"
+    elif not strikes:
+        yield "; nothing strikes in the motion it ended with: if something did, begin where it does, or with widths="
     if not any(isinstance(force, Gravity | GroundFriction) for force in world.forces):
         yield "; it has no gravity"
     if any(isinstance(channel.observer, JointPart) for channel in channels.values()):

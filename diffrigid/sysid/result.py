@@ -16,7 +16,7 @@ from diffrigid.state import State
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, check_intervals
 from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.first_rows import is_begun
-from diffrigid.sysid.intervals import derived, describe
+from diffrigid.sysid.intervals import derived, describe, without_interval
 from diffrigid.sysid.levenberg import best_by_record, levenberg
 from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.orders import Orders
@@ -25,7 +25,7 @@ from diffrigid.sysid.points import by_column
 from diffrigid.sysid.records import SAME_TIME, runs, same_data
 from diffrigid.sysid.setup import Problem, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Parameter, Summary
-from diffrigid.sysid.table import doubts_of, summary_html, summary_text
+from diffrigid.sysid.table import FAILED, summary_html, summary_text
 from diffrigid.sysid.times import all_times, motion
 from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
@@ -106,6 +106,12 @@ class Fit:
     def notes(self) -> tuple[str, ...]:
         """What the data cannot determine, and why not to believe the intervals; the lines with "!" under the table."""
         return self.summary.notes
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why not to believe any of the numbers, in the first words of such `notes`: "the fit failed", "not converged",
+        "the cost jumps", "residuals are autocorrelated"; () if there is no such reason."""
+        return self.summary.doubts
 
     @property
     def world(self) -> World:
@@ -220,8 +226,8 @@ class Fit:
         """A number, or an array, that follows from the fitted scene of a record, with its 95 % interval.
 
         The interval is symmetric, to first order in the errors of the fit, and uses the covariance and quantile of
-        those in the table (also after `with_intervals`). It is infinite where the data do not determine the number.
-        Its `note` says why not to trust it, if the fit as a whole is doubtful.
+        those in the table (also after `with_intervals`). It is infinite where the data do not determine the number,
+        and after a fit that failed. Its `note` says why not to trust it, if the fit as a whole is doubtful.
 
         Args:
             fn: of the world and the initial state, in operations of JAX.
@@ -238,7 +244,7 @@ class Fit:
         found = derived(
             self.problem, self.shared, self.own, self.linear, self.uncertainty, fn, checked_record(self, record)
         )
-        return replace(found, note="; ".join(doubts_of(self.summary)))
+        return replace(without_interval(found) if FAILED in self.doubts else found, note="; ".join(self.doubts))
 
     def with_intervals(self, intervals: Intervals) -> "Fit":
         """The same fit with intervals by another function: from_jacobian, sandwich, bootstrap.

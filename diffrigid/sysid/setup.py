@@ -104,7 +104,7 @@ def make_problem(
         tuple(found), shared, own, tuple(groups), longest, _common_width(found), np.inf, {}, dict(free),
         dict(observe or {}),
     )  # fmt: skip
-    return with_noise(problem, _noise_guesses(found))
+    return with_noise(problem, noise_guesses(found))
 
 
 def _doubt_times(found: Sequence[Run], longest: float, given: bool) -> None:
@@ -182,7 +182,7 @@ def _weights(run: Run, name: str, noise: Mapping[str, float], window: float, row
     return out
 
 
-def _noise_guesses(found: Sequence[Run]) -> dict[str, float]:
+def noise_guesses(found: Sequence[Run]) -> dict[str, float]:
     """Noise guessed for each column whose noise is not given: the median over the records."""
     guesses: dict[str, list[float]] = {}
     for run in found:

@@ -14,7 +14,7 @@ import numpy as np
 
 from diffrigid.catalogue import component
 from diffrigid.sysid.orders import Orders
-from diffrigid.sysid.table import HEADER, numbers, rows_of, summary_html, summary_text
+from diffrigid.sysid.table import HEADER, doubts_of, numbers, rows_of, summary_html, summary_text
 from diffrigid.tables import lined_up
 
 
@@ -67,6 +67,12 @@ class Summary:
             if name in p.name.split(" = "):
                 return replace(p, name=name)
         raise KeyError(f"no parameter {name!r}; there are {[p.name for p in self.parameters]}")
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why not to believe any of the numbers, in the first words of such `notes`: "the fit failed", "not converged",
+        "the cost jumps", "residuals are autocorrelated"; () if there is no such reason."""
+        return doubts_of(self)
 
     def __repr__(self) -> str:
         return summary_text(self)

@@ -17,8 +17,9 @@ STICKS = "larger values fit as well, see below"  # likewise of a friction that e
 ENDED = " ended where what slips begins to stick"  # behind its name, the beginning of the remark on it
 ZERO = 1e-6  # [-] of an inertia: what is smaller, with its interval, is rounding
 BOUND = "at its bound"  # note of a parameter that ended there
+FAILED = "the fit failed"  # beginning of the note of a fit whose numbers mean nothing
 # Beginnings of notes that concern every number.
-DOUBTS = ("the fit failed", "not converged", "the cost jumps", "residuals are autocorrelated")
+DOUBTS = (FAILED, "not converged", "the cost jumps", "residuals are autocorrelated")
 TABLE_RECORDS = 3  # records whose own numbers are in the table
 
 
@@ -70,9 +71,9 @@ def numbers(summary: "Summary") -> list[dict[str, Any]]:
     ]
 
 
-def doubts_of(summary: "Summary") -> list[str]:
+def doubts_of(summary: "Summary") -> tuple[str, ...]:
     """Beginnings of the notes that concern every number."""
-    return [doubt for doubt in DOUBTS if any(note.startswith(doubt) for note in summary.notes)]
+    return tuple(doubt for doubt in DOUBTS if any(note.startswith(doubt) for note in summary.notes))
 
 
 def below(summary: "Summary") -> list[str]:
