@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from closed_form import vector, with_slopes
 from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
 
 import diffrigid as dr
 from diffrigid import so3
@@ -538,3 +539,48 @@ def test_a_box_slides_past_an_edge_as_over_one_face(ground):
     assert_allclose(end.x[:, 0, 1:], state.x[:, 0, 1:], atol=1e-9)
     assert_allclose(end.v[:, 0, 0], np.maximum(v - mu * G * 4 / 60, 0.0), atol=1e-9)
     assert (end.x[:, 0, 0] > 0.3).all()
+
+
+def test_a_slip_turns_back_while_a_hinged_bob_swings():
+    """A box slows down, stops and slides back; a bob on it changes the normal force, as friction does through the bob.
+
+    Coulomb's law, with the stop as an event: two unknown accelerations, and the force in the hinge.
+    """
+    mu, inertia, arm, m, g, g_along, end = 0.15, 0.02, 0.25, 0.5, 9.81, 3.0, 0.3
+
+    def expected(v):
+        def rates(sense):  # of the slip; of x, the angle of the bob, and both rates
+            def fn(_, y):
+                s, c = np.sin(y[1]), np.cos(y[1])
+                matrix = [[1, 0, 1, mu * sense], [m, -m * arm * s, -1, 0], [0, m * arm * c, 0, -1]]
+                matrix = np.array([*matrix, [0, inertia, -arm * s, arm * c]])
+                by_spin = m * arm * y[3] ** 2
+                right = [g_along - mu * sense * g, m * g_along + by_spin * c, by_spin * s - m * g, 0.0]
+                return [y[2], y[3], *np.linalg.solve(matrix, right)[:2]]
+
+            return fn
+
+        def stop(_, y):
+            return y[2]
+
+        stop.terminal = True
+        tight = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+        there = solve_ivp(rates(-1.0), (0.0, end), [0.0, 0.0, -v, 0.0], events=stop, **tight)
+        assert there.status == 1 and there.t[-1] * 60 % 1 > 0.1  # well within a step
+        return solve_ivp(rates(1.0), (there.t[-1], end), there.y[:, -1], **tight).y[2, -1]
+
+    def simulated(v):
+        thrown = {"v": jnp.stack([-v, 0.0 * v])}
+        bodies = {
+            "box": dr.Body(dr.Box(half=(0.3, 0.1)), mass=1.0, x=(0.0, 0.1), **thrown),
+            "bob": dr.Body(None, mass=m, inertia=inertia, x=(arm, 0.1), **thrown),
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+        }
+        hinge = dr.Revolute("bob", "box", anchor_a=(-arm, 0.0))
+        scene = dr.scene(bodies, gravity=(g_along, -g), friction=mu, joints=[hinge])
+        return dr.rollout(*scene, dt=1 / 240, steps=72).state.v[-1, 0, 0]
+
+    v, h = jnp.asarray(1.1), 1e-5
+    found, slope = jax.jit(lambda v: jax.jvp(simulated, (v,), (jnp.ones_like(v),)))(v)
+    assert_allclose(found, expected(1.1), atol=3e-5)
+    assert_allclose(slope, (expected(1.1 + h) - expected(1.1 - h)) / (2 * h), atol=3e-3)

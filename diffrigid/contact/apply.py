@@ -5,14 +5,16 @@ and x by (T / 2) P / m: its centroid is in the middle of that time, and so are i
 that slides on a floor with Coulomb friction this is exact; for one that tips over, of second order.
 """
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrigid.branches import choose
 from diffrigid.contact.anchors import Anchors, struck
-from diffrigid.contact.known import Known, beside, loads, reversing
+from diffrigid.contact.known import Known, beside, loads, reversing, weighed
 from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
 from diffrigid.contact.order import Links, companions, over_islands
 from diffrigid.contact.resting import Law, Strikes, are_alone, barely, solve_impulses
@@ -43,6 +45,7 @@ def apply_impulses(
     kick: Array,
     held_for: Array,
     known: Known | None,
+    weighs: Array,
 ) -> tuple[Anchors, Known | None, Array | None]:
     """Solve for the impulses and re-anchor every struck body at the time of its impact.
 
@@ -52,6 +55,7 @@ def apply_impulses(
     Args:
         kick: 1, or 0 for a displacement that leaves velocities as they are.
         held_for: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
+        weighs: bool: without friction where it may reverse, to find out what it does, see `known.weighed`.
 
     Returns:
         the anchors; with `known`, the impulses of friction that reverses, and the corrections that undo the loads.
@@ -67,7 +71,7 @@ def apply_impulses(
     onto = None if link is None else _onto_joints(flight, t, link, (count > 0) & (kick > 0))
     if onto is not None:
         strikes = replace(strikes, v_rel=strikes.v_rel + relative_changes(strikes, *onto[:2]))
-    at = flight, t, mobility
+    at, unsolved = (flight, t, mobility), (strikes, law)
     strikes, law, held_for, P, early_P = _solved(world, at, strikes, law, kick, held_for, known, own[:, 0])
     load = None if known is None else loads(strikes, P, law.most, held_for)
     if known is not None:
@@ -75,8 +79,10 @@ def apply_impulses(
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     friction = None
     if known is not None:
-        found = rolling_reversing if is_rolling(world) else reversing
-        friction = found(mobility, strikes, P, (dv, dw), law, held_for, world.contact.rest_speed)
+        in_trial = rolling_reversing if is_rolling(world) else partial(reversing, weighs=known.trial is not None)
+        friction = in_trial(mobility, strikes, P, (dv, dw), law, held_for, world.contact.rest_speed)
+        if known.trial is not None:
+            friction = choose(weighs, weighed(mobility, unsolved[0], P, known, unsolved[1], held_for), friction)
     # A force that has acted evenly has its centroid in the middle of its time, for which it displaces by P / m.
     displacing = jnp.where(kick > 0, 0.5 * held_for, 1.0)[:, None] * P + early_P
     moved = velocities(mobility, *momentum_changes(strikes, displacing, moving))[:2]

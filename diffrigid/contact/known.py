@@ -3,6 +3,8 @@
 Friction that reverses   Where a slip stops and reverses while the contact is held, friction acts first one way, then
                          the other. A trial pass, with friction one way, tells the total; the trial is discarded, and
                          the next pass uses the total.
+                         Where bodies have joints, friction changes the normal force, and this the slip: a pass without
+                         friction there tells by how much.
 Loads                    A loaded contact must not move, in either direction. The displacement by its load is taken
                          back, and found anew with all gaps closed: this closes a gap that opened beside another
                          contact when the body turned within the step.
@@ -22,6 +24,7 @@ from diffrigid.contact.slipping import in_all, least_slip, most_resisting, pulle
 from diffrigid.numerics import dot, norm, normalise, safe_divide
 from diffrigid.pytree import array, pytree, replace
 
+STOPPED = 1e-6  # [-] of the slip at the beginning: along it, less than this at the end is a stop
 TELLS = 0.5  # [-] share of friction along the slip from which a trial tells how friction brakes it
 
 
@@ -31,11 +34,13 @@ class Known:
 
     P: Array = array("C", "D")  # [N s]; where gaps are closed (PUSH) [kg m]
     early: Array = array("C", "D")  # [N s^2] displacement beyond that of an even force, where friction reverses
-    rubs: Array = array("C")  # 1 where friction reverses, so that all of it is known, else 0
+    rubs: Array = array("C")  # 1 where friction reverses, so that all of it is known; -1 where it may not; else 0
+    # Where bodies have joints: impulses with friction one way, for those that may reverse.
+    trial: Array | None = array("C", "D", default=None)  # [N s]
 
     def reverses(self) -> Array:
-        """Whether some friction reverses in a world, (*batch) bool."""
-        return (self.rubs > 0).any(0)
+        """Whether some friction of a world is to be found anew, (*batch) bool."""
+        return (self.rubs != 0).any(0)
 
     def opened(self, strikes: Strikes) -> Array:
         """Whether a gap of a world is open, by more than rounding, where a contact carries a load, (*batch) bool."""
@@ -62,7 +67,7 @@ def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tupl
 
 def reversing(
     mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array,
-    rest_speed: Array, by_torques: Array | float = 0.0,
+    rest_speed: Array, by_torques: Array | float = 0.0, weighs: bool = False,
 ) -> Known:  # fmt: skip
     """Friction where a slip stops and reverses within T, from trial impulses P with friction acting one way.
 
@@ -71,6 +76,7 @@ def reversing(
     Args:
         changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P and by torques of rolling rows.
         by_torques: (C, D, *batch) [m/s] what v_rel gains by the latter, which `strikes` have already.
+        weighs: only name the contacts where friction may reverse, for `weighed`; rows of joints as ever.
     """
     held, heaviest = strikes.active & strikes.held & (T > 0), most_resisting(mobility, strikes)
 
@@ -94,14 +100,65 @@ def reversing(
         if law.most is not None:
             light = light | jnp.isfinite(law.most)
         drag = jnp.where(light, bound * per_impulse, 0.0)
-        P, early, turns = reversal(slip, at_end, bounds, drag, stops, T)
-        return Known(P=P, early=early, rubs=turns.astype(T.dtype))
+        turned, early, turns = reversal(slip, at_end, bounds, drag, stops, T)
+        if not weighs:
+            return Known(P=turned, early=early, rubs=turns.astype(T.dtype))
+        of_joint = jnp.zeros_like(held) if law.most is None else jnp.isfinite(law.most)
+        left = strikes.v_rel + relative_changes(strikes, *changes)
+        maybe = held & _stops(strikes, T, left, rest_speed) & (rubbed != 0).any(1)
+        turned, early = (jnp.where(of_joint[:, None], part, 0.0) for part in (turned, early))
+        return Known(P=turned, early=early, rubs=jnp.where(of_joint, turns, maybe).astype(T.dtype), trial=P)
 
     def nothing(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
         del changes, law
-        return Known(P=jnp.zeros_like(P), early=jnp.zeros_like(P), rubs=jnp.zeros_like(T))
+        none = jnp.zeros_like(P)
+        return Known(P=none, early=none, rubs=jnp.zeros_like(T), trial=none if weighs else None)
 
     return lax.cond(any_world(held), found, nothing, P, changes, law)
+
+
+def _stops(strikes: Strikes, T: Array, left: Array, rest_speed: Array) -> Array:
+    """Whether a slip of contacts that ends as `left` (C, D, *batch) [m/s] stops within T, (C, *batch) bool."""
+    slip = split(strikes.normal, strikes.v_rel - T[:, None] * strikes.pull)[1]
+    speed, onwards = jax.vmap(norm)(slip), jax.vmap(dot)(split(strikes.normal, left)[1], slip)
+    return (speed > least_slip(rest_speed)[None]) & (onwards <= STOPPED * speed**2)
+
+
+def weighed(mobility: Mobility, strikes: Strikes, P: Array, known: Known, law: Law, T: Array) -> Known:
+    """Friction of contacts where a slip may stop and reverse within T, from impulses P without friction there.
+
+    With friction f, of all contacts that slip as one, their normal forces and slips change linearly: its bound is
+    b + kappa f, so that it is b / (1 - kappa) until the stop, and b / (1 + kappa) the other way. P tells b, and the
+    trial the slopes. See `reversal`, of which this is the case with two bounds.
+    """
+    (_, mu, most), trial, n = law, jnp.asarray(known.trial), strikes.normal
+
+    def across(r: Array) -> Array:
+        return split(n, r)[1]
+
+    maybe = (known.rubs > 0) & strikes.active & (True if most is None else jnp.isinf(most))
+    free, by_trial = (across(strikes.v_rel + moved(each, strikes, mobility)) for each in (P, trial))
+    slip = across(strikes.v_rel - T[:, None] * strikes.pull)
+    pull, back = jax.vmap(norm)(free - slip), jax.vmap(normalise)(free - slip)
+    against, gained, rubbed = (jax.vmap(dot)(r, back) for r in (-slip, by_trial - free, across(trial)))
+    bound, bound_trial = (mu * jax.vmap(dot)(n, each) for each in (P, trial))
+    f, b = (in_all(strikes, maybe, part) for part in (rubbed, bound))
+    tells = maybe & (jnp.abs(f) > jnp.finfo(T.dtype).eps ** 0.5 * jnp.abs(b))
+    kappa, gain = (safe_divide(part, jnp.where(tells, f, 0.0)) for part in (bound_trial - bound, gained))
+    of_all = in_all(strikes, maybe, kappa)
+    tells = tells & (jnp.abs(of_all) < 1.0) & (gain > 0)
+    one_way, other_way = (b / jnp.where(tells, 1.0 + sign * of_all, 1.0) for sign in (-1.0, 1.0))
+    rise = pull + gain * one_way
+    turns = tells & (pull > gain * other_way) & (against > 0) & (against < rise)
+    share = safe_divide(against, jnp.where(turns, rise, 0.0))
+    first, second = bound + kappa * one_way, bound - kappa * other_way
+    friction = share * first - (1.0 - share) * second
+    early = 0.5 * share * (1.0 - share) * T * (first + second)
+    P, early = (jnp.where(turns, part, 0.0)[:, None] * back for part in (friction, early))
+    return Known(
+        P=jnp.where(maybe[:, None], P, known.P), early=jnp.where(maybe[:, None], early, known.early),
+        rubs=jnp.where(maybe, jnp.where(turns, 1.0, -1.0), known.rubs).astype(T.dtype), trial=trial,
+    )  # fmt: skip
 
 
 def loads(strikes: Strikes, P: Array, most: Array | None, T: Array) -> Array:

@@ -3,7 +3,8 @@
     IMPACT, up to `sweeps` times   the next impact of every body, at its true time, with restitution; resting contacts
                                    are held until then (`order.py`)
     HOLD                           resting contacts, at the end of the step: their normal velocities must not close
-    REVERSE                        instead of HOLD where a slip stops and reverses within the step (`known.py`)
+    WEIGH, REVERSE                 instead of HOLD where a slip stops and reverses within the step (`known.py`), the
+                                   first only for bodies with joints
     PUSH                           resting contacts: gaps left by rounding or rotation are closed; momenta are kept,
                                    energy to the order of the gap
 
@@ -56,7 +57,7 @@ from diffrigid.state import State
 if TYPE_CHECKING:
     from diffrigid.world import World
 
-IMPACT, HOLD, REVERSE, PUSH = 0, 1, 2, 3
+IMPACT, HOLD, WEIGH, REVERSE, PUSH = range(5)
 HOLDS = 4  # passes to hold resting contacts until the first impact: to its time in free fall, then each time from there
 
 
@@ -133,11 +134,13 @@ class Contact:
             impacts = now.found if done is None else now.found & (count >= done)
             needed = jnp.where(phase == IMPACT, impacts, any_world(now.rests))
             if now.known is not None:
-                needed = jnp.where(phase == REVERSE, any_world(now.known.reverses()), needed)
+                again = (phase == WEIGH) | (phase == REVERSE)
+                needed = jnp.where(again, any_world(now.known.reverses()), needed)
             return lax.cond(needed, lambda now: one_pass(now, phase), lambda now: now, now), None
 
         nothing = jnp.zeros((_rows(world), *start.state.x.shape[1:]), start.t0.dtype)
-        known = Known(P=nothing, early=nothing, rubs=nothing[:, 0]) if is_loaded(world) else None
+        trial = nothing if may_weigh(world) else None
+        known = Known(P=nothing, early=nothing, rubs=nothing[:, 0], trial=trial) if is_loaded(world) else None
         known, rests = with_tangents(known, (world, dt)), jnp.full(dt.shape, any(always))
         supported = jnp.zeros(start.t0.shape, bool) if matters(world) else None
         first = Progress(start, resting, supported, known, jnp.asarray(True), rests)
@@ -147,7 +150,8 @@ class Contact:
     def _phases(self, world: "World") -> list[int]:
         rows_only, loaded = all(driven(world)), is_loaded(world)  # motors and joint friction: no impacts, no gaps
         impacts = 0 if rows_only else self.sweeps + HOLDS * waits(world)
-        return [IMPACT] * impacts + [HOLD] + [REVERSE] * loaded + [PUSH] * (not rows_only)
+        again = [WEIGH] * may_weigh(world) + [REVERSE] * loaded
+        return [IMPACT] * impacts + [HOLD] + again + [PUSH] * (not rows_only)
 
     def saved_numbers(self, world: "World") -> int:
         """Approximate count of numbers saved per step (FOUND, PASSED) for reverse mode without recomputing the step."""
@@ -172,6 +176,11 @@ def _holds_all(world: "World") -> bool:
     return all(not held.isdisjoint(bodies) for bodies in islands(ends_of(world.joints), len(world.names)))
 
 
+def may_weigh(world: "World") -> bool:
+    """Whether friction of contacts may change the normal forces of bodies that joints connect. Static."""
+    return is_loaded(world) and bool(world.joints) and not (is_rolling(world) or all(driven(world)))
+
+
 class Progress(NamedTuple):
     """State handed from pass to pass."""
 
@@ -185,7 +194,7 @@ class Progress(NamedTuple):
 
 def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Array) -> Progress:
     anchors, resting, supported, known, _, rests = now
-    impact, reverse, push = (phase == kind for kind in (IMPACT, REVERSE, PUSH))
+    impact, weigh, reverse, push = (phase == kind for kind in (IMPACT, WEIGH, REVERSE, PUSH))
     flight = launch(anchors.state, anchors.t0)
     if supported is not None:
         look = functools.partial(find_supported, world, flight, anchors.since, dt)
@@ -197,7 +206,7 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
     rested = resting
     strikes, law, held_for, resting = _demanded(world, anchors, flight, strikes, resting, dt, phase)
     if known is not None:
-        skips = reverse & ~known.reverses()
+        skips = (weigh | reverse) & ~known.reverses()
         unused = skips | (push & ~opened)
         strikes = replace(strikes, active=strikes.active & ~skips[None])
 
@@ -205,10 +214,10 @@ def _pass(world: "World", now: Progress, launch: Callable, dt: Array, phase: Arr
         kick = jnp.where(push, 0.0, 1.0).astype(dt.dtype)
         applied = functools.partial(apply_impulses, world, anchors, flight, strikes, law, kick, held_for)
         if known is None:
-            return applied(None)[0], None
+            return applied(None, weigh)[0], None
         nothing = jax.tree.map(jnp.zeros_like, known)
-        after, friction, load = applied(choose(unused, nothing, known).there(strikes))
-        friction = choose(phase == HOLD, friction, nothing)
+        after, friction, load = applied(choose(unused, nothing, known).there(strikes), weigh)
+        friction = choose((phase == HOLD) | weigh, friction, nothing)
         reverses, load = friction.reverses(), jnp.where(impact | push, 0.0, load)
         following = replace(friction, P=jnp.where(reverses, friction.P, load))
         return choose(reverses, anchors, after), choose(skips, known, following)
@@ -272,7 +281,7 @@ def _held(
         stays: which would come to rest if they were struck now.
         fallen: which close no faster than after a step of free fall, so that they rested before it.
     """
-    impact, drives = phase == IMPACT, flags(driven(world), resting)
+    impact, again, drives = phase == IMPACT, (phase == WEIGH) | (phase == REVERSE), flags(driven(world), resting)
     held = strikes.active & strikes.held & (~impact | strikes.rests) & (resting | fallen)
     u, least = -jax.vmap(dot)(strikes.normal, strikes.v_rel), world.contact.rest_speed[None]
     slow = u <= least
@@ -282,7 +291,7 @@ def _held(
     parts = (u < -least) & (strikes.gap >= -strikes.rounding)
     touches = strikes.active & (resting | (jnp.abs(u) <= least)) & ~parts & ~drives
     held = jnp.where(phase == PUSH, touches, held)
-    return held, jnp.where(impact, resting | held | comes, jnp.where(phase == REVERSE, resting, held))
+    return held, jnp.where(impact, resting | held | comes, jnp.where(again, resting, held))
 
 
 def _fallen(world: "World", flight: Flight, strikes: Strikes, closing_acc: Array, dt: Array) -> Array:
