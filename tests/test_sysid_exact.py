@@ -683,3 +683,15 @@ def test_what_has_no_effect_but_rounding_widens_no_interval():
     for intervals in (from_jacobian, dr.sandwich, dr.bootstrap):
         alone = intervals(replace(linear, slopes=(J,), shared=3)).covariance
         assert_allclose(intervals(linear).covariance[:2, :2], alone[:2, :2], rtol=1e-4, atol=1e-5)
+
+
+def test_scores_and_motions_compile_nothing(fit, caplog):
+    """Those of a record about as long as those that were fitted, and of the first three records of the fit."""
+    with jax.log_compiles():
+        assert fit.score(many(seed=9)[2].observations)["p.x"] < 2 * NOISE
+        motions = [fit.predict(record=k) for k in range(3)]
+    said = [entry.getMessage() for entry in caplog.records]
+    assert said and not [text for text in said if "linearised" in text or "rollout" in text]
+    for k, motion in enumerate(motions):
+        again = fit.predict(times=motion.t, record=k)
+        jax.tree.map(partial(assert_allclose, rtol=0, atol=1e-12), motion.state, again.state)

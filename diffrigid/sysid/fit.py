@@ -180,7 +180,7 @@ def finish(
     if not np.isfinite(costs[best]):
         raise ValueError("fit: no start gives a finite motion: look at the values of the scene, or make dt smaller")
     order, alike = np.argsort(costs), costs <= costs[best] + AGREES + AGREES_RELATIVE * costs[best]
-    orders = impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum()))
+    orders, motions = impact_orders(problem, point.z.sorted(order), int(np.isfinite(costs).sum()))
     linear = linear_of(problem, point, best, loss, bool(problem.noise))
     in_units, strikes = by_column(problem, point, best, in_units=True), any(orders[0])
     _refuse_blind(problem, linear, in_units, strikes)
@@ -199,7 +199,7 @@ def finish(
     )  # fmt: skip
     return Fit(
         summary, problem, scenes, shared, own, linear, uncertainty, residuals,
-        np.asarray(point.z.shared, float)[:, order], loss, tuple(remarks),
+        np.asarray(point.z.shared, float)[:, order], loss, tuple(remarks), motions,
     )  # fmt: skip
 
 

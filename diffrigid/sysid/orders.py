@@ -14,7 +14,7 @@ from diffrigid.sysid.levenberg import Numbers
 from diffrigid.sysid.problem import SHOWN_RECORDS, SHOWN_STARTS, linearise, of_record
 from diffrigid.sysid.records import SAME_TIME
 from diffrigid.sysid.setup import Problem, fitted_scene
-from diffrigid.sysid.times import controls_over
+from diffrigid.sysid.times import controls_over, motion_of_steps
 from diffrigid.trajectory import Trajectory
 
 WRITTEN_ORDERS, WRITTEN_PAIRS = 3, 8  # orders that are written out, and pairs of each
@@ -22,14 +22,16 @@ WRITTEN_ORDERS, WRITTEN_PAIRS = 3, 8  # orders that are written out, and pairs o
 Orders = tuple[tuple[tuple[str, ...], ...], ...]
 
 
-def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
+def impact_orders(problem: Problem, z: Numbers, count: int) -> tuple[Orders, tuple[Trajectory, ...]]:
     """Pairs that strike, in order of time, for the first `count` starts z, 64 at most, and each of three records.
 
-    Motions have the steps of the fit, so that what is compiled already gives them.
+    Also the motions of the first start at the measured times of these records. Motions have the steps of the fit, so
+    that what is compiled already gives them.
     """
     records, starts = min(SHOWN_RECORDS, len(problem.runs)), min(SHOWN_STARTS, count)
     shared, own = np.asarray(z.shared, float), np.asarray(z.own, float)
     found: dict[tuple[int, int], tuple[str, ...]] = {}
+    motions: dict[int, Trajectory] = {}
     for group in problem.groups:
         chosen = [k for k, member in enumerate(group.members) if member < records]
         if not chosen:
@@ -47,7 +49,10 @@ def impact_orders(problem: Problem, z: Numbers, count: int) -> Orders:
                 state = jax.tree.map(lambda leaf, lane=lane: leaf[lane], states)
                 motion = Trajectory(t=t, state=state, world=scene.world, controls=controls)
                 found[start, group.members[k]] = order_of_impacts(motion)
-    return tuple(tuple(found[start, record] for record in range(records)) for start in range(starts))
+                if start == 0:
+                    motions[group.members[k]] = motion_of_steps(scene, run, state, problem.dt)
+    orders = tuple(tuple(found[start, record] for record in range(records)) for start in range(starts))
+    return orders, tuple(motions[record] for record in range(records)) if starts else ()
 
 
 def alike(orders: Orders) -> list[tuple[int, ...]]:

@@ -74,7 +74,8 @@ def by_column(problem: Problem, point: Point, best: int, in_units: bool = False)
             for name, weights in group.data.weights.items():
                 w = of_record(weights, k)
                 piece = values[first : first + w.size, k].reshape(w.shape)
-                found[name] = np.where(w > 0, piece / (np.where(w > 0, w, 1.0) if in_units else 1.0), np.nan)
+                piece = np.where(w > 0, piece / (np.where(w > 0, w, 1.0) if in_units else 1.0), np.nan)
+                found[name] = piece[: len(series_of(problem.runs[member], name).t)]
                 first += w.size
             out[member] = found
     return out

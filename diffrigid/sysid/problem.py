@@ -100,7 +100,7 @@ def _group(
     lengths = [np.concatenate([a, np.full(steps - len(a), longest)]) for a, _ in grids]
     acting = [controls_over(run, run.start + np.cumsum(h) - h) for run, h in zip(found, lengths, strict=True)]
     names = list(found[0].channels)
-    rows = {name: max(len(series_of(run, name).t) for run in found) for name in names}
+    rows = {name: _roomy(max(len(series_of(run, name).t) for run in found)) for name in names}
 
     def stacked(make, names=names):
         return {name: _side_by_side([_padded(make(k, name), rows[name]) for k in range(len(found))]) for name in names}
@@ -119,6 +119,36 @@ def _group(
     return Group(Plan(here, clocked, priors), jax.device_put(data), members)
 
 
+def shaped_like(groups: Sequence[Group], others: Sequence[Group], longest: float) -> list[Group]:
+    """The groups, padded to the shapes of others where they fit, so that what is compiled for these serves them too."""
+    alike = [(a, b) for a, b in zip(groups, others, strict=False) if a.plan == b.plan and _fits(a.data, b.data)]
+    if not len(alike) == len(groups) == len(others):
+        return list(groups)
+    return [replace(a, data=_shaped(a.data, b.data, longest)) for a, b in alike]
+
+
+def _fits(data: Data, other: Data) -> bool:
+    """Whether no array is larger, or has more axes or other inner ones."""
+    tree: Any = jax.tree.structure(data)
+    if tree != jax.tree.structure(other):
+        return False
+    shapes = [(a.shape, b.shape) for a, b in zip(jax.tree.leaves(data), jax.tree.leaves(other), strict=True)]
+    same = all(len(a) == len(b) and a[1:-1] == b[1:-1] for a, b in shapes)
+    return same and all(not a or (a[0] <= b[0] and a[-1] in (1, b[-1])) for a, b in shapes)
+
+
+def _shaped(data: Data, other: Data, longest: float) -> Data:
+    def shaped(leaf: Any, like: Array) -> Any:
+        if not leaf.ndim:
+            return leaf
+        whole = np.broadcast_to(np.asarray(leaf), (*leaf.shape[:-1], like.shape[-1]))
+        return _padded(whole, like.shape[0]) if leaf.ndim > 1 else whole
+
+    found = jax.tree.map(shaped, data, other)
+    lengths = np.where(found.lengths > 0, found.lengths, np.asarray(longest, found.lengths.dtype))
+    return jax.device_put(found._replace(lengths=lengths))
+
+
 def known(run: Run, name: str) -> np.ndarray:
     """Whether residuals of a column are measured, (K, size of the residual) bool."""
     finite = np.isfinite(series_of(run, name).values)
@@ -131,6 +161,12 @@ def full_turn(run: Run, name: str) -> float:
     """Change of the reading of a column of angles by a full turn; 0 for other columns."""
     channel = run.channels[name]
     return 2.0 * np.pi * abs(float(channel.scale)) if is_angle(channel) else 0.0
+
+
+def _roomy(count: int) -> int:
+    """Up to an eighth more, so that records with about as many rows have one shape."""
+    unit = 1 << max(count.bit_length() - 4, 0)
+    return -(-count // unit) * unit
 
 
 def _padded(array: np.ndarray, rows: int) -> np.ndarray:

@@ -136,7 +136,7 @@ def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], strikes
         series.name
         for run, record in zip(problem.runs, residuals, strict=True)
         for series in run.series
-        if _is_lost(run, series.name, series.values, record[series.name][: len(series.t)], least)
+        if _is_lost(run, series.name, series.values, record[series.name], least)
     ]
     if not names:
         return ""

@@ -22,6 +22,7 @@ from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.points import by_column
+from diffrigid.sysid.problem import shaped_like
 from diffrigid.sysid.records import SAME_TIME, runs, same_data
 from diffrigid.sysid.setup import Problem, make_problem, make_starts, reach_of, with_noise
 from diffrigid.sysid.summary import Parameter, Summary
@@ -56,6 +57,7 @@ class Fit:
     starts: np.ndarray  # (a, starts) z of the shared numbers where every start ended, the best first, as `costs`
     loss: Loss
     remarks: tuple[str, ...]  # those of `notes` that do not depend on the intervals
+    motions: tuple[Trajectory, ...]  # of the first three records, at their measured times
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -154,6 +156,8 @@ class Fit:
             ValueError: times begin before the record; there is no such record.
         """
         scene, run = self.scenes[checked_record(self, record)], self.problem.runs[record]
+        if times is None and dt is None and record < len(self.motions):
+            return self.motions[record]
         wanted = all_times(run) if times is None else np.asarray(times, float)
         if wanted.ndim != 1 or not len(wanted) or wanted[0] < run.start - SAME_TIME or not (np.diff(wanted) > 0).all():
             given = f"times has shape {wanted.shape}" + (f" and begins at {wanted.flat[0]:g} s" if wanted.size else "")
@@ -182,24 +186,30 @@ class Fit:
         free, observe = self.problem.free, self.problem.observe
         scored = runs(self.world, self.state, observations, observe, None)
         fitted = [[k for k, run in enumerate(self.problem.runs) if same_data(run, other)] for other in scored]
+        records = list(observations) if isinstance(observations, list | tuple) else [observations]
+        # As many records as were fitted, and padded like them: then what is compiled for the fit serves here.
+        extra = max(len(self.problem.runs) - len(records), 0)
         problem = make_problem(
-            self.world, self.state, observations, free=free, observe=observe, resume=self.summary,
-            dt=self.problem.dt, places=[found[0] if found else None for found in fitted],
+            self.world, self.state, [*records, *records[-1:] * extra], free=free, observe=observe, resume=self.summary,
+            dt=self.problem.dt, places=[found[0] if found else None for found in [*fitted, *fitted[-1:] * extra]],
         )  # fmt: skip
         problem = with_noise(problem, {name: self.noise.get(name, s) for name, s in problem.noise.items()})
+        groups = shaped_like(problem.groups, self.problem.groups, self.problem.dt)
+        problem = replace(problem, groups=tuple(groups))
         z, reach = make_starts(problem, starts, seed), reach_of(problem, range(problem.sizes[0]))
         z = z._replace(shared=jnp.repeat(z.shared[:, :1], starts, axis=1))
         iterations = SCORE_ITERATIONS if problem.own else 0
         point, _ = levenberg(problem.groups, z, self.loss, iterations, reach)
         best = best_by_record(problem.groups, point, self.loss)
-        found = [by_column(problem, point, start, in_units=True)[k] for k, start in enumerate(best)]
+        found = [by_column(problem, point, start, in_units=True)[k] for k, start in enumerate(best[: len(scored)])]
         names = dict.fromkeys(name for columns in found for name in columns)
         values = {
             name: np.concatenate([columns[name].ravel() for columns in found if name in columns]) for name in names
         }
         sizes = {name: float(np.sqrt(np.nanmean(residuals**2))) for name, residuals in values.items()}
-        borrowed = [k for k, run in enumerate(problem.runs) if not (fitted[k] or is_begun(run, problem.own))]
-        late = [] if problem.own else [k for k, run in enumerate(problem.runs) if not (fitted[k] or run.stated)]
+        own_runs = problem.runs[: len(scored)]
+        borrowed = [k for k, run in enumerate(own_runs) if not (fitted[k] or is_begun(run, problem.own))]
+        late = [] if problem.own else [k for k, run in enumerate(own_runs) if not (fitted[k] or run.stated)]
         self._warn_of_starts(sizes, borrowed, late)
         return sizes
 

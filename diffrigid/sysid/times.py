@@ -9,6 +9,7 @@ from jax import Array
 
 from diffrigid.convert import positive
 from diffrigid.forces import is_constant
+from diffrigid.state import State
 from diffrigid.step import rollout, steps_in
 from diffrigid.sysid.parameters import Scene
 from diffrigid.sysid.records import SAME_TIME, Run
@@ -61,6 +62,20 @@ def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
     since = _with_changes(run, _once([run.start], t))
     controls = controls_over(run, since[:-1])
     states = rollout(scene.world, scene.state, dt=longest, times=since - run.start, controls=controls).state
+    return _picked(scene, since, states, controls, t)
+
+
+def motion_of_steps(scene: Scene, run: Run, states: State, longest: float) -> Trajectory:
+    """The same at all measured times, from the states (S+1, ...) at the ends of the steps of `grid`."""
+    t, counts = _steps(run, longest)
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    since = np.interp(np.arange(ends[-1] + 1), ends, t)
+    states = jax.tree.map(lambda leaf: leaf[: len(since)], states)
+    return _picked(scene, since, states, controls_over(run, since[:-1]), all_times(run))
+
+
+def _picked(scene: Scene, since: np.ndarray, states: State, controls: dict | None, t: np.ndarray) -> Trajectory:
+    """States at times t (K,) [s], which are among those `since` (S+1,) of all states, and the means of controls."""
     wanted, gaps = np.searchsorted(since, t - SAME_TIME), np.diff(since)[:, None]
 
     def mean(values: np.ndarray) -> np.ndarray:
@@ -76,9 +91,13 @@ def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
 
 def grid(run: Run, longest: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Lengths of steps that land on every measured time, and for each column the index of the state of each row."""
-    t = _with_changes(run, all_times(run))
-    gaps = np.diff(t)
-    counts = steps_in(gaps, longest)
-    ends = np.concatenate([[0], np.cumsum(counts)])
+    t, counts = _steps(run, longest)
+    gaps, ends = np.diff(t), np.concatenate([[0], np.cumsum(counts)])
     index = {s.name: ends[np.clip(np.searchsorted(t, s.t - SAME_TIME), 0, len(t) - 1)] for s in run.series}
     return np.repeat(gaps / counts, counts), index
+
+
+def _steps(run: Run, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times (K,) [s] on which steps land, and the number of steps (K - 1,) between them."""
+    t = _with_changes(run, all_times(run))
+    return t, steps_in(np.diff(t), longest)

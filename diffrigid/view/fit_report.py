@@ -111,7 +111,7 @@ def impacts(motion: Trajectory) -> np.ndarray:
 
 def residual_chart(fit: "Fit", record: int, series: Series, events: np.ndarray) -> str:
     """Chart of the residuals of one column over time; "" where nothing of it was measured."""
-    values = fit.residuals[record][series.name][: len(series.t)]
+    values = fit.residuals[record][series.name]
     if not np.isfinite(values).any():
         return ""
     count = values.shape[1]
