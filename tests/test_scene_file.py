@@ -178,6 +178,11 @@ def test_fit_from_the_command_line(tmp_path):
     saved = dr.load_fit(tmp_path / "fit.json")
     assert_allclose(saved["gravity"].value, (0.0, -9.81), atol=1e-6)
     assert "scene: fall.csv" in (tmp_path / "fit.html").read_text(encoding="utf-8")
+    lines = [f"{1e3 * t:.3f},{np.sin(9 * t):.6f},1.0" for t in np.arange(60) / 60]
+    (tmp_path / "swings.csv").write_text("\n".join(["time,x,p.x[1]", *lines]) + "\n")
+    with contextlib.redirect_stdout(said):
+        assert main(["fit", files[0], str(tmp_path / "swings.csv")]) == 1
+    assert "! the fit failed" in said.getvalue()
     with pytest.raises(SystemExit), contextlib.redirect_stderr(said):
         main(["fit", files[0], str(Path(tmp_path) / "none.csv")])
     assert "none.csv" in said.getvalue()

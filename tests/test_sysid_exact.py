@@ -258,10 +258,11 @@ def test_a_fit_that_is_none_says_so(records, column):
     data = {"t": r["t"], column: 1e3 * (r["p.x"] if column == "p.x" else r["p.x"][:, 1])}
     found = dr.fit(*point(), data, free={"gravity[1]": dr.interval(-20, 20)}, progress=False)
     assert found.notes[0].startswith("the fit failed: residuals of p.x are as large")
+    assert found.doubts[0] == "the fit failed" and np.isinf(found["gravity[1]"].high)
     assert found.notes[0].endswith("no two shapes of this scene can meet: does it lack a floor?")
     g = found.derived(lambda world, _: dr.paths.read(world, None, "gravity")[1])
     assert g.note == "the fit failed; residuals are autocorrelated"  # also where it stands alone
-    assert found.rows()[0]["note"] == f"at its bound; {g.note}"
+    assert np.isinf(g.low) and found.rows()[0]["note"] == f"at its bound; {g.note}"
     again = found.with_intervals(sysid.from_jacobian)
     assert again.notes == found.notes
 

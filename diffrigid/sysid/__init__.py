@@ -16,6 +16,7 @@ of each record, m residuals.
 """
 
 from diffrigid.sysid.charts import direction, inertia, rotation, shares
+from diffrigid.sysid.columns import read_csv
 from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
 from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
 from diffrigid.sysid.fit import fit
@@ -62,6 +63,7 @@ __all__ = [
     "positive",
     "prior",
     "profile",
+    "read_csv",
     "real",
     "residual_vector",
     "rotation",

@@ -75,11 +75,24 @@ def columns(
 def read_csv(
     path: str | Path, left_out: Collection[str] = (), only: Mapping[str, str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Read the columns of a file with one line of names; an empty cell is a missing value.
-
-    Those that are `left_out`, and with `only`, names of columns and what these are for, all others, may hold anything.
+    """Read the columns of a file with one line of names, as `fit` does; an empty cell is a missing value.
 
     Between columns are commas, or semicolons or tabs where the names have these; numbers may then have decimal commas.
+
+    Args:
+        left_out: names of columns that may hold anything.
+        only: names of the columns that are read, and what they are for, for messages; None: all.
+
+    Raises:
+        ValueError: what is not numbers under one line of names.
+        OSError: there is no such file.
+
+    Example:
+        >>> Path("drop.csv").write_text("time;height_mm\\n0,5;1250,0\\n0,6;1193,5\\n") > 0
+        True
+        >>> table = dr.read_csv("drop.csv")
+        >>> {"t": table["time"], "ball.x[1]": 1e-3 * table["height_mm"]}["ball.x[1]"].tolist()
+        [1.25, 1.1935]
     """
     try:
         with open(Path(path), newline="", encoding="utf-8-sig") as file:  # a number would be an open file
