@@ -118,7 +118,7 @@ def fit(
     z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)
 
-    def through(problem: Problem, z: Numbers, stages: Sequence[tuple[float, float]]) -> tuple[Problem, Point, str]:
+    def through(problem: Problem, z: Numbers, stages: Sequence[tuple[float, Any]]) -> tuple[Problem, Point, str]:
         for width, window in stages:
             problem = with_noise(problem, problem.noise, window, width)
             point, early = solve(problem.groups, z, loss, iterations, reach, partial(report, _stage(width, window)))
@@ -241,10 +241,11 @@ def _seen(problem: Problem, linear: Linear) -> dict[str, bool]:
     return {slot.name: bool(np.any(sizes[rows] > 0)) for slot, rows in pieces(problem.slots)}
 
 
-def _stage(width: float, window: float) -> str:
+def _stage(width: float, window: Any) -> str:
     """What a stage of a fit is of, for the line of progress."""
-    wide, long = f", {width:.3g} m wide", f", the first {window:.3g} s"
-    return (wide if width > 0 else "") + (long if window < np.inf else "")
+    first = float(np.min(window))
+    wide, long = f", {width:.3g} m wide", f", the first {first:.3g} s"
+    return (wide if width > 0 else "") + (long if first < np.inf else "")
 
 
 def _printer(progress: bool | None, starts: int) -> Callable[[str, int, np.ndarray], None]:

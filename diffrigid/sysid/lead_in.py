@@ -2,20 +2,31 @@
 
 Where a first guess strikes another corner, or another body, than the measured motion did, all that follows is wrong,
 and a fit of the whole record ends there. Up to the first impacts a record is easily fitted, and each window begins
-where the last one ended.
+where the last one ended. Where the columns jump in their slope, something struck: windows end just before, so that each
+adds an impact and what follows it. One that ends just after an impact would be fitted as well by a bent flight.
 """
+
+from typing import Any
 
 import jax
 import numpy as np
 
 from diffrigid.branches import choose
+from diffrigid.sysid.columns import Series
 from diffrigid.sysid.diagnosis import RARE, whiteness
 from diffrigid.sysid.levenberg import Point, cost_of
 from diffrigid.sysid.losses import Loss
 from diffrigid.sysid.points import by_column
+from diffrigid.sysid.problem import full_turn
+from diffrigid.sysid.records import MEDIAN, Run
+from diffrigid.sysid.sensors import is_turn
 from diffrigid.sysid.setup import Problem
+from diffrigid.sysid.times import all_times
 
 PARTS = 8  # windows of a record
+JUMP = 5.0  # [-] standard deviations of the change of a slope by noise
+TOGETHER = 2.5  # [-] times the usual interval: jumps that follow each other sooner are one
+LEAST_ROWS, MANY = 8, 0.3  # rows of a column in which jumps are looked for, and share of them that are none
 SUSPECT = 2.0  # [-] of the noise: residuals beyond this that are not noise suggest a local minimum
 
 
@@ -30,10 +41,42 @@ def is_suspect(problem: Problem, point: Point, loss: Loss) -> bool:
     return bool(np.nanmean(np.concatenate(series) ** 2) > SUSPECT**2) and whiteness(series) < RARE
 
 
-def growing(problem: Problem) -> list[float]:
-    """Windows [s] up to the whole of the longest record, which is inf."""
-    longest = max(float(series.t[-1]) - run.start for run in problem.runs for series in run.series)
-    return [*(longest * np.arange(1, PARTS) / PARTS), np.inf]
+def growing(problem: Problem) -> list[Any]:
+    """Windows [s], each for all records or (R,), the last one inf: up to the jumps, or else parts of the longest."""
+    ends = [before_jumps(run) for run in problem.runs]
+    if not all(map(len, ends)):
+        longest = max(float(series.t[-1]) - run.start for run in problem.runs for series in run.series)
+        return [*(longest * np.arange(1, PARTS) / PARTS), np.inf]
+    most = max(map(len, ends))
+    chosen = np.unique(np.linspace(0, most - 1, min(most, PARTS)).round().astype(int))
+    return [*(np.array([own[k] if k < len(own) else np.inf for own in ends]) for k in chosen), np.inf]
+
+
+def before_jumps(run: Run) -> np.ndarray:
+    """Times [s] since the start of a record of the last rows before its columns jump in their slope, increasing."""
+    found = np.unique(np.concatenate([np.zeros(0), *(_jumps(run, series) for series in run.series)]))
+    apart = np.diff(found, prepend=-np.inf) > TOGETHER * float(np.median(np.diff(all_times(run))))
+    return found[apart] - run.start
+
+
+def _jumps(run: Run, series: Series) -> np.ndarray:
+    """Times of the rows of a column before its slope jumps by much more than it usually does."""
+    known = np.isfinite(series.values).all(1)
+    t, values = series.t[known], series.values[known]
+    if len(t) < LEAST_ROWS:
+        return np.zeros(0)
+    if is_turn(run.channels[series.name]):  # q and -q are one
+        signs = np.where((values[1:] * values[:-1]).sum(1) < 0, -1.0, 1.0)
+        values = values * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
+    if turn := full_turn(run, series.name):
+        values = np.unwrap(values, axis=0, period=turn)
+    h = np.diff(t)[:, None]
+    slopes = np.diff(values, axis=0) / h
+    scale = np.sqrt(h[1:] ** -2 + h[:-1] ** -2 + (1.0 / h[1:] + 1.0 / h[:-1]) ** 2)  # of the noise in their differences
+    change = np.diff(slopes, axis=0) / scale
+    change = np.abs(change - np.median(change, axis=0))
+    rows = np.flatnonzero((change > JUMP * np.median(change, axis=0) / MEDIAN).any(1))  # row k + 1 is in the middle
+    return t[rows[rows > 0]] if len(rows) < MANY * len(change) else np.zeros(0)
 
 
 def better(loss: Loss, first: Point, second: Point) -> Point:

@@ -38,7 +38,7 @@ class Problem:
     groups: tuple[Group, ...]
     dt: float  # [s] the longest step
     width: float  # [m] of smooth impacts
-    window: float  # [s] from the start of each record; later values have no weight
+    window: float  # [s] from the start of each record, the shortest; later values have no weight
     noise: dict[str, float]  # of columns whose noise is not given with their record
     free: Mapping[Any, Any]  # as the user gave it
     observe: Mapping[str, Any]  # likewise
@@ -138,28 +138,26 @@ def scene_of(run: Run) -> Scene:
     return Scene(run.world, run.state, run.channels, run.written)
 
 
-def with_noise(
-    problem: Problem, noise: Mapping[str, float], window: float | None = None, width: float | None = None
-) -> Problem:
+def with_noise(problem: Problem, noise: Mapping[str, float], window: Any = None, width: float | None = None) -> Problem:
     """Set the weights of a problem for this noise.
 
     Args:
-        window: [s] of each record from its start; None: as it is.
+        window: [s] of each record from its start, a number or (R,); None: as it is.
         width: [m] of smooth impacts; None: as it is. Until one is positive, only exact impacts are compiled.
     """
-    window = problem.window if window is None else float(window)
+    windows = np.broadcast_to(problem.window if window is None else window, len(problem.runs))
     width = problem.width if width is None else float(width)
     groups = []
     for group in problem.groups:
         weights = {}
         for name, old in group.data.weights.items():
-            rows = [_weights(problem.runs[k], name, noise, window, old.shape[0]) for k in group.members]
+            rows = [_weights(problem.runs[k], name, noise, windows[k], old.shape[0]) for k in group.members]
             weights[name] = jax.device_put(np.stack(rows, axis=-1).astype(old.dtype))
         exact = width == 0 and group.data.width is None
         width_now = None if exact else jnp.asarray(width, group.data.lengths.dtype)
         data = group.data._replace(weights=weights, width=width_now)
         groups.append(replace(group, data=data))
-    return replace(problem, groups=tuple(groups), noise=dict(noise), width=width, window=window)
+    return replace(problem, groups=tuple(groups), noise=dict(noise), width=width, window=float(windows.min()))
 
 
 def _weights(run: Run, name: str, noise: Mapping[str, float], window: float, rows: int) -> np.ndarray:
