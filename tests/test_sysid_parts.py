@@ -13,6 +13,7 @@ from diffrigid import sysid
 from diffrigid.impacts import order_of_impacts
 from diffrigid.sysid.diagnosis import Blind, coordinates, doubts, misjudged, normality, whiteness
 from diffrigid.sysid.intervals import interval_of, unseen_of
+from diffrigid.sysid.lead_in import before_jumps, ways_in
 from diffrigid.sysid.levenberg import Numbers, Point, minimise
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.orders import in_words
@@ -255,6 +256,36 @@ def test_what_is_seen_of_an_inertia_has_an_interval():
     assert_allclose(wide[0, 1], 0.0, atol=1e-12)
     names = [row[0] for row in rows_of(Parameter("die.inertia", value, low, high, "kg m^2", ""))]
     assert names == [f"die.inertia[{k}, {k}]" for k in range(3)]
+
+
+def test_windows_end_before_what_was_measured_jumps():
+    """A ball that bounces, a third of its rows missing; another column shows a spin, as q or as -q, that an impact ends."""
+    random, t = np.random.default_rng(4), np.arange(120) / 120
+    height = 0.5 - 4.9 * t**2 + np.where(t < 0.3, 0.0, 5.2 * (t - 0.3))
+    x = np.stack([0.4 * t, 0.0 * t, height], 1) + 1e-3 * random.standard_normal((120, 3))
+    x[random.random(120) < 0.33] = np.nan
+    half = 2.0 * np.minimum(t, 0.7)
+    q = np.stack([np.cos(half), np.sin(half), 0.0 * t, 0.0 * t], 1) * random.choice([-1.0, 1.0], 120)[:, None]
+    q = q + 1e-3 * random.standard_normal((120, 4))
+    die, free = dr.scene({"die": dr.Body(dr.Sphere(0.05), mass=1.0, x=(0.0, 0.0, 0.5))}), {"die.x": dr.real()}
+
+    def ends(data):
+        return [before_jumps(run) for run in sysid.make_problem(*die, data, free=free).runs][0]
+
+    (bounce,) = ends({"t": 5.0 + t, "die.x": x})
+    assert 0.3 - 3 / 120 <= bounce <= 0.3
+    assert_allclose(ends({"t": 5.0 + t, "die.x[2]": x[:, 2]}), [bounce], atol=1e-9)
+    both = ends({"t": 5.0 + t, "die.x": x, "die.q": q})
+    assert_allclose(both, [bounce, 0.7], atol=2.5 / 120)
+    assert (both < [0.3, 0.7 + 1e-9]).all()
+    smooth = np.stack([0.4 * t, np.sin(3.0 * t), 0.5 - 4.9 * t**2], 1)
+    assert not len(ends({"t": t, "die.x": smooth + 1e-3 * random.standard_normal((120, 3))}))
+    windows, evenly = ways_in(
+        sysid.make_problem(*die, [{"t": t, "die.x": x}, {"t": t, "die.x": x, "die.q": q}], free=free)
+    )
+    assert_allclose(windows[0], [bounce, bounce], atol=1e-9)
+    assert np.abs(np.stack(windows[:-1])[:, 1] - both[1]).min() < 1e-9 and windows[-1] == evenly[-1] == np.inf
+    assert (np.diff(np.stack(windows[:-1])[:, 1]) < 1.01 * t[-1] / 16).all()
 
 
 def test_a_symmetric_matrix_is_in_the_table_once():

@@ -16,7 +16,7 @@ from diffrigid.sysid.columns import check_mapping
 from diffrigid.sysid.covariance import Intervals, Linear, check_intervals, from_jacobian
 from diffrigid.sysid.free import Each, Free, Prior, Through
 from diffrigid.sysid.intervals import describe
-from diffrigid.sysid.lead_in import better, growing, is_suspect
+from diffrigid.sysid.lead_in import better, is_suspect, unseen_until, ways_in
 from diffrigid.sysid.levenberg import INTERRUPTED, Numbers, Point, cost_of, levenberg, point_at
 from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.noise import all_noise, estimated_noise, rescaled
@@ -76,8 +76,9 @@ def fit(
         widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets starts that
             miss an impact find it. Default: the width of the world, 0 unless set.
         windows: [s] of each record from its start, one fit after the other: (0.5, 1, 2, inf) leads into a long one.
-            Default: (inf,), and eighths of the longest record after it, if residuals are left that are not noise; each
-            start then keeps the better result. (inf,) alone leaves that out.
+            Default: (inf,), and if residuals are left that are not noise, windows that end before the columns jump
+            in their slope, and others in eighths of the longest record; each start keeps the best result. (inf,) alone
+            leaves that out.
         loss: `diffrigid.sysid.squares()`, `dr.huber()` or `dr.student()`.
         solver: default Levenberg-Marquardt; for many numbers `diffrigid.sysid.first_order(optax.adam(1e-2))` or
             `diffrigid.sysid.lbfgs()`.
@@ -118,21 +119,27 @@ def fit(
     z, reach = make_starts(problem, starts, seed), reach_of(problem)
     report = _printer(progress, starts)
 
-    def through(problem: Problem, z: Numbers, stages: Sequence[tuple[float, Any]]) -> tuple[Problem, Point, str]:
+    def through(
+        problem: Problem, z: Numbers, stages: Sequence[tuple[float, Any]], held: Sequence[int] = ()
+    ) -> tuple[Problem, Point, str]:
+        """Fits one after the other, in the first of them without the shared numbers that are held."""
+        most = reach_of(problem, held)
         for width, window in stages:
             problem = with_noise(problem, problem.noise, window, width)
-            point, early = solve(problem.groups, z, loss, iterations, reach, partial(report, _stage(width, window)))
-            z = point.z
+            point, early = solve(problem.groups, z, loss, iterations, most, partial(report, _stage(width, window)))
+            z, most = point.z, reach
             if early == INTERRUPTED:
                 break
         return problem, point, early
 
     problem, point, early = through(problem, z, stages)
     leads_in = windows is None and solver is None and early != INTERRUPTED and is_suspect(problem, point, loss)
-    if leads_in:
-        other = through(problem, z, [(problem.width, window) for window in growing(problem)])
-        early = other[2]
-        point = point if early == INTERRUPTED else better(loss, point, other[1])
+    for way in ways_in(problem) if leads_in else ():
+        held = unseen_until(problem, z, 0.5 * np.min(way[0]))
+        _, other, early = through(problem, z, [(problem.width, window) for window in way], held)
+        point = point if early == INTERRUPTED else better(loss, point, other)
+        if early == INTERRUPTED or not is_suspect(problem, point, loss):
+            break
     if early != INTERRUPTED and (problem.noise or leads_in):  # with the estimate of the noise from the residuals
         problem = with_noise(problem, estimated_noise(problem, point, loss))
         problem, point, early = through(problem, point.z, stages[-1:])

@@ -2,10 +2,11 @@
 
 Where a first guess strikes another corner, or another body, than the measured motion did, all that follows is wrong,
 and a fit of the whole record ends there. Up to the first impacts a record is easily fitted, and each window begins
-where the last one ended. Where the columns jump in their slope, something struck: windows end just before, so that each
-adds an impact and what follows it. One that ends just after an impact would be fitted as well by a bent flight.
+where the last one ended. Where the columns jump in their slope, something struck: windows end just before, the first of
+them at the end of the flight. One that ends just after an impact would be fitted as well by a bent flight.
 """
 
+import itertools
 from typing import Any
 
 import jax
@@ -14,13 +15,13 @@ import numpy as np
 from diffrigid.branches import choose
 from diffrigid.sysid.columns import Series
 from diffrigid.sysid.diagnosis import RARE, whiteness
-from diffrigid.sysid.levenberg import Point, cost_of
+from diffrigid.sysid.levenberg import Numbers, Point, cost_of, point_at
 from diffrigid.sysid.losses import Loss
 from diffrigid.sysid.points import by_column
 from diffrigid.sysid.problem import full_turn
 from diffrigid.sysid.records import MEDIAN, Run
 from diffrigid.sysid.sensors import is_turn
-from diffrigid.sysid.setup import Problem
+from diffrigid.sysid.setup import Problem, with_noise
 from diffrigid.sysid.times import all_times
 
 PARTS = 8  # windows of a record
@@ -41,15 +42,23 @@ def is_suspect(problem: Problem, point: Point, loss: Loss) -> bool:
     return bool(np.nanmean(np.concatenate(series) ** 2) > SUSPECT**2) and whiteness(series) < RARE
 
 
-def growing(problem: Problem) -> list[Any]:
-    """Windows [s], each for all records or (R,), the last one inf: up to the jumps, or else parts of the longest."""
+def ways_in(problem: Problem) -> list[list[Any]]:
+    """Lists of growing windows [s], each for all records or (R,), the last inf: by their jumps, if any, and evenly."""
     ends = [before_jumps(run) for run in problem.runs]
+    longest = max(float(series.t[-1]) - run.start for run in problem.runs for series in run.series)
+    evenly = [*(longest * np.arange(1, PARTS) / PARTS), np.inf]
     if not all(map(len, ends)):
-        longest = max(float(series.t[-1]) - run.start for run in problem.runs for series in run.series)
-        return [*(longest * np.arange(1, PARTS) / PARTS), np.inf]
-    most = max(map(len, ends))
-    chosen = np.unique(np.linspace(0, most - 1, min(most, PARTS)).round().astype(int))
-    return [*(np.array([own[k] if k < len(own) else np.inf for own in ends]) for k in chosen), np.inf]
+        return [evenly]
+    ends = [_parted(own, longest, longest / (2 * PARTS)) for own in ends]
+    by_jumps = [np.array([own[k] if k < len(own) else np.inf for own in ends]) for k in range(max(map(len, ends)))]
+    return [[*by_jumps, np.inf], evenly]
+
+
+def _parted(jumps: np.ndarray, end: float, most: float) -> np.ndarray:
+    """Jumps, and between and after them times that are no more than `most` [s] apart."""
+    edges = np.append(jumps, end)
+    parts = [np.linspace(a, b, int(np.ceil((b - a) / most)) + 1)[:-1] for a, b in itertools.pairwise(edges) if b > a]
+    return np.concatenate(parts)
 
 
 def before_jumps(run: Run) -> np.ndarray:
@@ -61,8 +70,9 @@ def before_jumps(run: Run) -> np.ndarray:
 
 def _jumps(run: Run, series: Series) -> np.ndarray:
     """Times of the rows of a column before its slope jumps by much more than it usually does."""
-    known = np.isfinite(series.values).all(1)
-    t, values = series.t[known], series.values[known]
+    values = series.values[:, np.isfinite(series.values).any(0)]  # some components of a column may never be seen
+    known = np.isfinite(values).all(1)
+    t, values = series.t[known], values[known]
     if len(t) < LEAST_ROWS:
         return np.zeros(0)
     if is_turn(run.channels[series.name]):  # q and -q are one
@@ -77,6 +87,16 @@ def _jumps(run: Run, series: Series) -> np.ndarray:
     change = np.abs(change - np.median(change, axis=0))
     rows = np.flatnonzero((change > JUMP * np.median(change, axis=0) / MEDIAN).any(1))  # row k + 1 is in the middle
     return t[rows[rows > 0]] if len(rows) < MANY * len(change) else np.zeros(0)
+
+
+def unseen_until(problem: Problem, z: Numbers, window: float) -> list[int]:
+    """Shared numbers that nothing before that time [s] depends on, such as a restitution: held until the first impact.
+
+    Otherwise flights that a poor first guess bends to the floor are fitted by moving the floor.
+    """
+    point = point_at(with_noise(problem, problem.noise, window).groups, z)
+    seen = [(np.asarray(jacobian)[:, : problem.sizes[0]] != 0).any((0, 2, 3)) for jacobian in point.jacobians]
+    return np.flatnonzero(~np.any(seen, axis=0)).tolist()
 
 
 def better(loss: Loss, first: Point, second: Point) -> Point:
