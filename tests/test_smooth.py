@@ -191,6 +191,7 @@ def test_the_phase_of_the_step_does_not_matter(kind):
     assert_allclose(slopes, 0.0, atol=EXACT)
 
 
+@pytest.mark.slow
 def test_corners_that_turn_round_within_the_level_have_slopes():
     """Two pentagons begin a step nearer than their level, part, and come together again by their spins."""
     angles = 0.4 * np.pi * np.arange(5)
@@ -242,6 +243,7 @@ def test_boxes_whose_paths_sink_into_each_other_have_slopes():
     assert_allclose(slopes, (high - low) / 2e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_crossed_rods_strike_by_the_depth_of_their_rounding():
     """The axes of the predicted paths cross, so that they come as close as minus the sum of the radii."""
     rod, width = dr.Capsule(radius=0.05, half_length=0.2), 0.02
