@@ -32,6 +32,7 @@ from diffrigid.trajectory import Trajectory
 from diffrigid.world import World
 
 SCORE_ITERATIONS = 30  # iterations for the own numbers of a record that was held out
+COPIES = 16  # records of a fit up to which those of a score are repeated, so that nothing is compiled
 POOR = 3.0  # [-] times the noise of the fit: scores beyond which a start that was not the record's own is doubted
 
 
@@ -188,7 +189,7 @@ class Fit:
         fitted = [[k for k, run in enumerate(self.problem.runs) if same_data(run, other)] for other in scored]
         records = list(observations) if isinstance(observations, list | tuple) else [observations]
         # As many records as were fitted, and padded like them: then what is compiled for the fit serves here.
-        extra = max(len(self.problem.runs) - len(records), 0)
+        extra = max(len(self.problem.runs) - len(records), 0) if len(self.problem.runs) <= COPIES else 0
         problem = make_problem(
             self.world, self.state, [*records, *records[-1:] * extra], free=free, observe=observe, resume=self.summary,
             dt=self.problem.dt, places=[found[0] if found else None for found in [*fitted, *fitted[-1:] * extra]],

@@ -62,28 +62,32 @@ def motion(scene: Scene, run: Run, t: np.ndarray, longest: float) -> Trajectory:
     since = _with_changes(run, _once([run.start], t))
     controls = controls_over(run, since[:-1])
     states = rollout(scene.world, scene.state, dt=longest, times=since - run.start, controls=controls).state
-    return _picked(scene, since, states, controls, t)
+    wanted = np.searchsorted(since, t - SAME_TIME)
+    return _of_rows(scene, t, _rows_of(states, wanted), wanted, since, controls)
 
 
 def motion_of_steps(scene: Scene, run: Run, states: State, longest: float) -> Trajectory:
-    """The same at all measured times, from the states (S+1, ...) at the ends of the steps of `grid`."""
-    t, counts = _steps(run, longest)
+    """The same at all measured times, from the states (S+1, ...), of NumPy, at the ends of the steps of `grid`."""
+    (steps, counts), t = _steps(run, longest), all_times(run)
     ends = np.concatenate([[0], np.cumsum(counts)])
-    since = np.interp(np.arange(ends[-1] + 1), ends, t)
-    states = jax.tree.map(lambda leaf: leaf[: len(since)], states)
-    return _picked(scene, since, states, controls_over(run, since[:-1]), all_times(run))
+    since = np.interp(np.arange(ends[-1] + 1), ends, steps)
+    wanted = np.searchsorted(since, t - SAME_TIME)
+    rows = jax.device_put(jax.tree.map(lambda leaf: leaf[wanted], states))
+    return _of_rows(scene, t, rows, wanted, since, controls_over(run, since[:-1]))
 
 
-def _picked(scene: Scene, since: np.ndarray, states: State, controls: dict | None, t: np.ndarray) -> Trajectory:
-    """States at times t (K,) [s], which are among those `since` (S+1,) of all states, and the means of controls."""
-    wanted, gaps = np.searchsorted(since, t - SAME_TIME), np.diff(since)[:, None]
+def _of_rows(
+    scene: Scene, t: np.ndarray, state: State, wanted: np.ndarray, since: np.ndarray, controls: dict | None
+) -> Trajectory:
+    """States at times t (K,) [s], the `wanted` ones of those `since` (S+1,), with the means of controls over steps."""
+    gaps = np.diff(since)[:, None]
 
     def mean(values: np.ndarray) -> np.ndarray:
         return np.add.reduceat(gaps * values, wanted[:-1]) / np.diff(t)[:, None]
 
     return Trajectory(
         t=t,  # type: ignore[arg-type]
-        state=_rows_of(states, wanted),
+        state=state,
         world=scene.world,
         controls=jax.tree.map(mean, controls),
     )
