@@ -686,6 +686,17 @@ def test_what_has_no_effect_but_rounding_widens_no_interval():
         assert_allclose(intervals(linear).covariance[:2, :2], alone[:2, :2], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("interval", [1 / 250, 1 / 59.94, 0.013, 0.1 / 3])
+def test_the_fitted_motion_has_all_measured_times_in_single_precision(interval):
+    """Lengths of steps that add up to a little more than the last of them too."""
+    world, state = (jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), part) for part in spring(2.0, 0.0))
+    t = interval * np.arange(25)
+    data = {"t": t, "p.x[0]": np.cos(2 * t)}
+    found = dr.fit(world, state, data, free={"spring.stiffness": dr.positive()}, progress=False)
+    assert_allclose(found.trajectory.t, t)
+    assert_allclose(found.trajectory.state.x[:, 0, 0], np.cos(2 * t), atol=1e-4)
+
+
 def test_scores_and_motions_compile_nothing(fit, caplog):
     """Those of a record about as long as those that were fitted, and of the first three records of the fit."""
     with jax.log_compiles():

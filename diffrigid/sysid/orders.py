@@ -5,16 +5,16 @@ early: between two orders the cost has a kink, or a jump, that no gradient cross
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
 
 from diffrigid.impacts import order_of_impacts
 from diffrigid.sysid.levenberg import Numbers
-from diffrigid.sysid.problem import SHOWN_RECORDS, SHOWN_STARTS, linearise, of_record
-from diffrigid.sysid.records import SAME_TIME
+from diffrigid.sysid.problem import SHOWN_RECORDS, SHOWN_STARTS, linearise
 from diffrigid.sysid.setup import Problem, fitted_scene
-from diffrigid.sysid.times import controls_over, motion_of_steps
+from diffrigid.sysid.times import controls_over, grid, motion_of_steps
 from diffrigid.trajectory import Trajectory
 
 WRITTEN_ORDERS, WRITTEN_PAIRS = 3, 8  # orders that are written out, and pairs of each
@@ -39,9 +39,7 @@ def impact_orders(problem: Problem, z: Numbers, count: int) -> tuple[Orders, tup
         states = jax.tree.map(np.asarray, linearise(group.plan, z.of(group.members), group.data)[2])
         for k in chosen:
             run = problem.runs[group.members[k]]
-            t = np.concatenate([[0.0], np.cumsum(of_record(group.data.lengths, k), dtype=float)])
-            end = max(series.t[-1] for series in run.series) - run.start
-            t = t[t <= end + SAME_TIME]  # shorter records are padded
+            t: Any = np.concatenate([[0.0], np.cumsum(grid(run, problem.dt)[0])])  # shorter records are padded
             controls = controls_over(run, run.start + t[:-1])
             for start in range(starts):
                 scene = fitted_scene(problem, group, k, shared[:, start], own[..., start])
