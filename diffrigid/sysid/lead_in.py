@@ -7,6 +7,7 @@ them at the end of the flight. One that ends just after an impact would be fitte
 """
 
 import itertools
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -43,15 +44,24 @@ def is_suspect(problem: Problem, point: Point, loss: Loss) -> bool:
 
 
 def ways_in(problem: Problem) -> list[list[Any]]:
-    """Lists of growing windows [s], each for all records or (R,), the last inf: by their jumps, if any, and evenly."""
+    """Lists of growing windows [s], each for all records or (R,), the last inf.
+
+    If the columns jump, first up to each of their jumps, then with short parts after the first; last of all evenly.
+    """
     ends = [before_jumps(run) for run in problem.runs]
     longest = max(float(series.t[-1]) - run.start for run in problem.runs for series in run.series)
     evenly = [*(longest * np.arange(1, PARTS) / PARTS), np.inf]
     if not all(map(len, ends)):
         return [evenly]
-    ends = [_parted(own, longest, longest / (2 * PARTS)) for own in ends]
-    by_jumps = [np.array([own[k] if k < len(own) else np.inf for own in ends]) for k in range(max(map(len, ends)))]
-    return [[*by_jumps, np.inf], evenly]
+    parted = [_parted(own, longest, longest / (2 * PARTS)) for own in ends]
+    most = max(map(len, ends))
+    chosen = np.unique(np.linspace(0, most - 1, min(most, PARTS)).round().astype(int))
+    return [_of_all(ends, chosen), _of_all(parted, range(max(map(len, parted)))), evenly]
+
+
+def _of_all(ends: list[np.ndarray], chosen: Iterable[int]) -> list[Any]:
+    """The chosen ones of the ends of each record [s], inf where it has fewer, as windows (R,), and the whole."""
+    return [*(np.array([own[k] if k < len(own) else np.inf for own in ends]) for k in chosen), np.inf]
 
 
 def _parted(jumps: np.ndarray, end: float, most: float) -> np.ndarray:
