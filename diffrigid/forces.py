@@ -274,10 +274,23 @@ def total_wrench(forces: tuple, bodies: Bodies, state: State, controls: Any) -> 
     F, tau = jnp.zeros_like(state.v), None
     for force in forces:
         wrench = force(bodies, state, controls)
+        _check_wrench(force, wrench, state)
         F = F + wrench.F
         if wrench.tau is not None and getattr(force, "twists", True):
             tau = wrench.tau if tau is None else tau + wrench.tau
     return Wrench(F=F, tau=tau)
+
+
+def _check_wrench(force: Any, wrench: Any, state: State) -> None:
+    """Refuse what broadcasting would spread over all bodies, or fail on without a name."""
+    where = f"force {type(force).__name__}"
+    if not isinstance(wrench, Wrench):
+        raise TypeError(f"{where} returned a {type(wrench).__name__}, expected Wrench(F=..., tau=...)")
+    for name, found, like in (("F", wrench.F, state.v), ("tau", wrench.tau, state.w)):
+        if found is not None and jnp.shape(found)[:2] != like.shape[:2]:
+            raise ValueError(
+                f"{where}: {name} has shape {jnp.shape(found)}, expected {like.shape}, a row for each body"
+            )
 
 
 FORCES = Gravity, Drag, GroundFriction, Force, Torque, SpringDamper

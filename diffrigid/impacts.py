@@ -98,8 +98,9 @@ def contacts(trajectory: Trajectory, times: np.ndarray | None = None) -> Meeting
     `point` (M, D) [m] and `impulse` (M, D) [N s] on `a`, or on `b` where only that moves; and `names` of all colliders.
     NumPy, without derivatives. It prints as a table.
 
-    A trajectory stores states, and not impulses: these are the least that explain its changes of momentum. Contacts
-    with a `Profile` or a `HeightField`, and those within a crowd (256 bodies and more, see `Contact`), are not found.
+    A trajectory stores states, and not impulses: these are the least that explain its changes of momentum. Where a body
+    strikes two others between two stored times, only their sum is sure: store more times. Contacts with a `Profile` or
+    a `HeightField`, and those within a crowd (256 bodies and more, see `Contact`), are not found.
 
     Args:
         times: (F,) [s] resting contacts are given only for intervals that begin then; default all.

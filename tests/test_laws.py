@@ -1,5 +1,6 @@
 """Conservation laws and symmetries, in two and three dimensions."""
 
+from collections.abc import Callable
 from functools import cache, partial
 
 import jax
@@ -13,7 +14,7 @@ from numpy.testing import assert_allclose
 
 import diffrigid as dr
 from diffrigid import so3
-from diffrigid.pytree import Leaf, array, pytree
+from diffrigid.pytree import Leaf, array, pytree, static
 
 ROUNDING = 1e-12  # relative: sums of some hundred terms
 PUSHED = 3e-6  # relative energy: what a side that turns presses is held by an even force, whose error falls as dt^3
@@ -473,6 +474,33 @@ class Follow:
 
     def __call__(self, bodies, state, controls):
         return dr.Wrench(F=self.damping * (state.v.sum(0, keepdims=True) - len(bodies.mass) * state.v))
+
+
+@pytree
+class Returns:
+    """A force that returns `wrench(velocities)`."""
+
+    wrench: Callable = static()
+
+    def __call__(self, bodies, state, controls):
+        return self.wrench(state.v)
+
+
+@pytest.mark.parametrize(
+    "wrench, message",
+    [
+        (lambda v: dr.Wrench(F=v[0]), r"force Returns: F has shape \(2,\), expected \(2, 2\), a row for each body"),
+        (lambda v: dr.Wrench(F=v[:1]), r"F has shape \(1, 2\), expected \(2, 2\)"),
+        (lambda v: dr.Wrench(F=v, tau=v), r"tau has shape \(2, 2\), expected \(2, 1\)"),
+        (lambda v: v, r"force Returns returned a .*Tracer, expected Wrench\(F=..., tau=...\)"),
+    ],
+)
+def test_a_force_that_is_no_wrench_of_all_bodies_is_refused(wrench, message):
+    """One force for two bodies would be broadcast to both."""
+    disc = dr.Disc(radius=0.1)
+    bodies = {"a": dr.Body(disc, mass=1.0, x=(0.0, 0.0)), "b": dr.Body(disc, mass=1.0, x=(1.0, 0.0))}
+    with pytest.raises((TypeError, ValueError), match=message):
+        dr.step(*dr.scene(bodies, forces=[Returns(wrench=wrench)]), 0.1)
 
 
 @pytest.mark.parametrize("mutual", [False, True])

@@ -17,6 +17,7 @@ from scipy.special import stdtrit
 import diffrigid as dr
 from diffrigid import sysid
 from diffrigid.sysid.covariance import Linear, from_jacobian, own_covariance
+from diffrigid.sysid.intervals import spanning
 from diffrigid.sysid.levenberg import Numbers, point_at
 from diffrigid.sysid.profile import ProfileLikelihood
 from diffrigid.sysid.remarks import beside_a_jump, failed
@@ -387,6 +388,19 @@ def test_a_fit_moves_as_it_was_fitted():
         assert fitted.score({"t": t, "ball.x": moved})["ball.x"] < 1e-6
     with pytest.raises(ValueError, match="expected the same in all of them"):
         dr.fit(world, state, [dr.Record({"t": t, "ball.x": moved}, world=w) for w in (world, smooth)], free=free)
+
+
+def test_starts_that_fit_as_well_widen_an_interval(fit):
+    """Elsewhere than the best, as friction that makes a ball grip does beside one that lets it slide."""
+    p, elsewhere = fit.parameters[0], fit.shared.copy()
+    elsewhere[0] += 1.0
+    (found, *others), notes = spanning(fit.problem, fit.parameters, np.stack([fit.shared, elsewhere], axis=1))
+    assert_allclose(found.high, [p.value[0] + 1.0, p.high[1]])
+    assert_allclose(found.low, p.low)
+    assert notes == [f"{p.name}: starts that fit as well ended elsewhere; its interval spans where they did"]
+    assert others == list(fit.parameters[1:])
+    same = spanning(fit.problem, fit.parameters, fit.starts[:, : fit.agree])
+    assert same == (fit.parameters, [])
 
 
 def test_score_and_prediction_of_held_out_records(fit):

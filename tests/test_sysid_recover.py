@@ -1,6 +1,7 @@
 """Known parameters come back from noisy and partly missing records, and what cannot be known is said in words."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -294,6 +295,37 @@ def test_a_hinge_that_rubs_tells_dry_friction_from_damping():
     check(fit, {"hinge.friction": 0.25, "hinge.damping": 0.06}, widest=0.02)
     assert_allclose(fit.noise["rod.angle"], 5e-3, rtol=0.2)
     assert fit["hinge.friction"].unit == "N m" and "hinge.friction and hinge.damping go together" in repr(fit)
+
+
+@pytest.mark.slow
+def test_a_score_leads_in_where_the_whole_record_ends_in_a_local_minimum():
+    """A ball into a corner, whose first rows tell little of its spin: eight held-out records, each to its noise."""
+    ball = dr.Body(dr.Disc(radius=0.03), mass=0.1, inertia=3.6e-5, x=(0.3, 0.9), v=(1.0, 0.0))
+
+    def scene(floor, wall, friction):
+        walls = {
+            "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0)), restitution=floor),
+            "wall": dr.Static(dr.HalfSpace(normal=(-1.0, 0.0), offset=-0.9), restitution=wall),
+        }
+        return dr.scene({"ball": ball, **walls}, gravity=(0.0, -9.81), friction=friction)
+
+    world, state = scene(0.8, 0.6, 0.2)
+    thrown = dr.replace(state, v=jnp.array([[1.3, 0.4]]), w=jnp.array([[-5.0]]))
+    t = np.arange(84) / 60
+    motion = dr.rollout(world, thrown, dt=1 / 120, times=t)
+    x, angle = np.asarray(motion.state.x[:, 0]), np.asarray(motion["ball.angle"])
+    random = np.random.default_rng(0)
+
+    def record():
+        places, turns = x + 2e-3 * random.normal(size=x.shape), angle + 0.05 * random.normal(size=t.shape)
+        return {"t": t, "ball.x": places, "ball.angle": np.angle(np.exp(1j * turns))}
+
+    free = {f"ball.{field}": dr.each(dr.real()) for field in ("x", "v", "w", "angle")}
+    free |= dict.fromkeys(("floor.restitution", "wall.restitution", "friction"), dr.interval(0, 1))
+    found = dr.fit(*scene(0.7, 0.7, 0.3), [record(), record()], free=free, progress=False)
+    assert not found.doubts
+    for _ in range(8):
+        assert found.score(record())["ball.x"] < 2.6e-3
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from diffrigid.sysid.charts import Chart
 from diffrigid.sysid.columns import check_mapping
 from diffrigid.sysid.covariance import Intervals, Linear, check_intervals, from_jacobian
 from diffrigid.sysid.free import Each, Free, Prior, Through
-from diffrigid.sysid.intervals import describe
+from diffrigid.sysid.intervals import describe, spanning
 from diffrigid.sysid.lead_in import better, is_suspect, unseen_until, ways_in
 from diffrigid.sysid.levenberg import INTERRUPTED, Numbers, Point, cost_of, levenberg, point_at
 from diffrigid.sysid.losses import Loss, Squares
@@ -200,9 +200,10 @@ def finish(
         remarks = [*jump, *(remark for remark in remarks if remark == INTERRUPTED)]
     remarks = [*remarks, *remarks_on(problem, scenes, in_units, strikes), *stuck]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss, remarks)
+    parameters, spans = spanning(problem, parameters, np.asarray(point.z.shared, float)[:, alike])
     summary = Summary(
         parameters=parameters, noise=all_noise(problem), costs=costs[order], orders=orders, agree=int(alike.sum()),
-        notes=(*remarks, *notes), seed=seed, seconds=time.time() - began, versions=versions(),
+        notes=(*remarks, *spans, *notes), seed=seed, seconds=time.time() - began, versions=versions(),
     )  # fmt: skip
     return Fit(
         summary, problem, scenes, shared, own, linear, uncertainty, residuals,
@@ -235,11 +236,11 @@ def _shown_by(path: str) -> str:
     if field.endswith("friction"):
         return (
             "give a record in which something slips, or rolls; if it does, begin with less friction, so that it does "
-            "in the simulation too"
+            "in the simulation too, or from several starts"
         )
     if field in ("mass", "density"):
         return "give a record in which the body strikes, pushes or pulls one of known mass, or a known force acts on it"
-    return "give a record that shows it"
+    return "give a record that shows it; if one does, begin elsewhere, or from several starts"
 
 
 def _seen(problem: Problem, linear: Linear) -> dict[str, bool]:

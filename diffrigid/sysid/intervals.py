@@ -60,6 +60,27 @@ def describe(
     return parameters, (*notes, *_doubts(problem, linear, residuals, loss))
 
 
+def spanning(
+    problem: Problem, parameters: Sequence[Parameter], shared: np.ndarray
+) -> tuple[tuple[Parameter, ...], list[str]]:
+    """Widen intervals to the values of all starts that fit as well, shared numbers (a, S), and say of which.
+
+    An interval by slopes knows one motion only; another one, that sticks for instance, may fit as well.
+    """
+    out, notes = {p.name: p for p in parameters}, []
+    for slot, rows in pieces(problem.shared):
+        p = out[slot.name]
+        if not isinstance(slot.kind, Free) or not np.isfinite(p.high - p.low).all():
+            continue
+        about = first_value(problem, slot)
+        values = np.stack([np.asarray(slot.kind.value(z, about), float) for z in shared[rows].T])
+        low, high = values.min(0), values.max(0)
+        if ((low < p.low) | (high > p.high)).any():
+            out[slot.name] = replace(p, low=np.minimum(p.low, low), high=np.maximum(p.high, high))
+            notes.append(f"{slot.name}: starts that fit as well ended elsewhere; its interval spans where they did")
+    return tuple(out.values()), notes
+
+
 def without_interval(p: Parameter) -> Parameter:
     """A number of a fit that failed, which may be anything."""
     return replace(p, low=np.full_like(p.low, -np.inf), high=np.full_like(p.high, np.inf))

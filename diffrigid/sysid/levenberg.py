@@ -197,6 +197,14 @@ def _chosen(better: Array, whole: Array, new: Point, old: Point, members: tuple[
     return Point(z, tuple(r), tuple(jac))
 
 
+@partial(jax.jit, static_argnames=("loss", "members"))
+def better_by_record(loss: Loss, members: tuple[tuple[int, ...], ...], first: Point, second: Point) -> Point:
+    """Of each record and start the point with the lower cost, where no shared number differs."""
+    costs = [_in_order(members, [_costs(loss, r) for r in point.residuals]) for point in (first, second)]
+    lower = costs[1] < costs[0]
+    return _chosen(lower, jnp.zeros_like(lower[0]), second, first, members)
+
+
 def best_by_record(groups: Sequence[Group], point: Point, loss: Loss) -> np.ndarray:
     """The start with the lowest cost for each record, (R,)."""
     members = tuple(group.members for group in groups)

@@ -16,8 +16,9 @@ from diffrigid.state import State
 from diffrigid.sysid.covariance import Intervals, Linear, Uncertainty, check_intervals
 from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.first_rows import is_begun
-from diffrigid.sysid.intervals import derived, describe, without_interval
-from diffrigid.sysid.levenberg import best_by_record, levenberg
+from diffrigid.sysid.intervals import derived, describe, spanning, without_interval
+from diffrigid.sysid.lead_in import is_suspect, ways_in
+from diffrigid.sysid.levenberg import Numbers, Point, best_by_record, better_by_record, levenberg
 from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene
@@ -170,10 +171,11 @@ class Fit:
     def score(self, observations: Any, starts: int = 1, seed: int = 0) -> dict[str, float]:
         """Root mean square of the residuals of other records by column, in its unit, with the shared numbers held.
 
-        Parameters that each record has of its own are fitted anew. The first start is the `state` of the record if it
-        has one, otherwise the state that its first rows show, if that is free by `each`, otherwise (with a warning if
-        the score is poor) the fitted state of record 0. A record that was part of the fit starts from its fitted
-        values. The motion starts at the first row: a later part of a record is `Record(data, start=...)`.
+        Parameters that each record has of its own are fitted anew, by growing windows where a fit of all rows fails.
+        The first start is the `state` of the record if it has one, otherwise the state that its first rows show, if
+        that is free by `each`, otherwise (with a warning if the score is poor) the fitted state of record 0. A record
+        that was part of the fit starts from its fitted values. The motion starts at the first row: a later part of a
+        record is `Record(data, start=...)`.
 
         Args:
             observations: one record or several, as `fit` takes them.
@@ -201,6 +203,8 @@ class Fit:
         z = z._replace(shared=jnp.repeat(z.shared[:, :1], starts, axis=1))
         iterations = SCORE_ITERATIONS if problem.own else 0
         point, _ = levenberg(problem.groups, z, self.loss, iterations, reach)
+        if problem.own and is_suspect(problem, point, self.loss):
+            point = self._led_in(problem, z, point, reach)
         best = best_by_record(problem.groups, point, self.loss)
         found = [by_column(problem, point, start, in_units=True)[k] for k, start in enumerate(best[: len(scored)])]
         names = dict.fromkeys(name for columns in found for name in columns)
@@ -213,6 +217,20 @@ class Fit:
         late = [] if problem.own else [k for k, run in enumerate(own_runs) if not (fitted[k] or run.stated)]
         self._warn_of_starts(sizes, borrowed, late)
         return sizes
+
+    def _led_in(self, problem: Problem, start: Numbers, point: Point, reach: Numbers) -> Point:
+        """What windows that grow from the start of each record find where a fit of the whole is in a local minimum."""
+        members = tuple(group.members for group in problem.groups)
+        for way in ways_in(problem):
+            z = start
+            for window in way:
+                groups = with_noise(problem, problem.noise, window).groups
+                found, _ = levenberg(groups, z, self.loss, SCORE_ITERATIONS, reach)
+                z = found.z
+            point = better_by_record(self.loss, members, point, found)
+            if not is_suspect(problem, point, self.loss):
+                break
+        return point
 
     def _warn_of_starts(self, sizes: dict[str, float], borrowed: list[int], late: list[int]) -> None:
         """Warn if a score is poor where records began at the state of the first record of the fit, perhaps too late."""
@@ -268,7 +286,8 @@ class Fit:
         parameters, notes = describe(
             self.problem, self.shared, self.own, self.linear, uncertainty, self.residuals, self.loss, self.remarks
         )
-        summary = replace(self.summary, parameters=parameters, notes=(*self.remarks, *notes))
+        parameters, spans = spanning(self.problem, parameters, self.starts[:, : self.summary.agree])
+        summary = replace(self.summary, parameters=parameters, notes=(*self.remarks, *spans, *notes))
         return replace(self, summary=summary, uncertainty=uncertainty)
 
     def rows(self) -> list[dict[str, Any]]:
