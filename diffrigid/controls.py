@@ -50,7 +50,9 @@ def as_controls(
     given = controls if isinstance(controls, Mapping) else {}
     for name, size in sizes.items():
         if name not in given:
-            raise ValueError(f"controls has no {name!r}: give controls={{{name!r}: ...}} of shape {(*steps, size)}")
+            others = f", but {', '.join(map(repr, given))}" if given else ""
+            give = f"give controls={{{name!r}: ...}} of shape {(*steps, size)}"
+            raise ValueError(f"controls has no {name!r}{others}: {give}")
     if not isinstance(controls, Mapping) or any(name not in sizes for name in controls):
         if all(isinstance(force, FORCES) for force in forces):
             unused = [name for name in given if name not in sizes] or [controls]

@@ -18,6 +18,7 @@ from diffrigid.shapes import HalfSpace, dimension, traced, with_topology
 from diffrigid.state import rotations
 
 TYPED = 1e-4  # [-] by which a length, or the triangle inequality, may be off: typed numbers have a few digits
+FEW = 16  # numbers that a message shows in full
 NO_THICKNESS = 1e-9  # [-] of the largest principal inertia: a body with a smaller one has no thickness
 
 Numbers = Any  # np.ndarray where known, Array where traced
@@ -54,11 +55,23 @@ def numbers(where: str, value: Any, shape: tuple[int, ...] | None, finite: bool 
     if shape is not None and array.shape != shape:
         raise ValueError(f"{where} has shape {array.shape}: expected {expected}, without batch axes")
     if finite and not traced(array):
-        if not np.isfinite(array).all():
-            raise ValueError(f"{where} is {array}: expected finite numbers; look for a NaN where it was made")
-        if (np.abs(array) > largest(array.dtype)).any():
-            raise ValueError(f"{where} is {array}: too large for {array.dtype}, its cube overflows; use other units")
+        if (wrong := ~np.isfinite(array)).any():
+            raise ValueError(
+                f"{_first(where, array, wrong)}: expected finite numbers; look for a NaN where it was made"
+            )
+        if (wrong := np.abs(array) > largest(array.dtype)).any():
+            raise ValueError(
+                f"{_first(where, array, wrong)}: too large for {array.dtype}, its cube overflows; use other units"
+            )
     return array
+
+
+def _first(where: str, array: Any, wrong: Any) -> str:
+    """What is wrong in words: all numbers if they are few, otherwise the first wrong one."""
+    if array.size <= FEW:
+        return f"{where} is {array}"
+    index = tuple(np.argwhere(wrong)[0].tolist())
+    return f"{where}[{', '.join(map(str, index))}] is {array[index]}"
 
 
 def largest(dtype: Any) -> float:

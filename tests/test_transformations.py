@@ -284,11 +284,11 @@ def test_a_batch_leaves_controls_of_other_forces_as_they_are():
     "controls, message",
     [
         (None, r"controls has no 'push': give controls=\{'push': ...\} of shape \(4, 2\)"),
-        ({"pusch": np.zeros((4, 2))}, "controls has no 'push'"),
+        ({"pusch": np.zeros((4, 2))}, "controls has no 'push', but 'pusch': give"),
         ({"push": np.zeros((4, 2)), "pull": np.zeros((4, 2))}, "no force takes 'pull': did you mean 'push'"),
         ({"push": np.zeros((4, 2)), 0: np.zeros((4, 2)), "pull": 1.0}, "no force takes 0, 'pull': there are push"),
         ({"push": np.zeros((3, 2))}, r"controls\['push'\] has shape \(3, 2\): expected \(4, 2\)"),
-        ({"push": np.full((4, 2), np.nan)}, "expected finite numbers"),
+        ({"push": np.full((4, 2), np.nan)}, r"(?s)controls\['push'\] is \[\[nan.*: expected finite numbers"),
         ({"push": "hard"}, "expected numbers"),
         (np.zeros((4, 2)), "controls has no 'push'"),
     ],
@@ -296,6 +296,10 @@ def test_a_batch_leaves_controls_of_other_forces_as_they_are():
 def test_wrong_controls(controls, message):
     with pytest.raises(ValueError, match=message):
         dr.rollout(*pushed(), dt=0.1, steps=4, controls=controls)
+    many = np.zeros((40, 2))
+    many[3, 1] = np.nan
+    with pytest.raises(ValueError, match=r"^controls\['push'\]\[3, 1\] is nan: expected finite numbers"):
+        dr.rollout(*pushed(), dt=0.1, steps=40, controls={"push": many})
     with pytest.raises(ValueError, match="no force takes 'push': give Force or Torque a control"):
         dr.rollout(*dr.scene({"ball": PUCK}), dt=0.1, steps=4, controls={"push": np.zeros((4, 2))})
 
