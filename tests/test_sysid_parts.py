@@ -280,9 +280,10 @@ def test_windows_end_before_what_was_measured_jumps():
     assert (both < [0.3, 0.7 + 1e-9]).all()
     smooth = np.stack([0.4 * t, np.sin(3.0 * t), 0.5 - 4.9 * t**2], 1)
     assert not len(ends({"t": t, "die.x": smooth + 1e-3 * random.standard_normal((120, 3))}))
-    windows, evenly = ways_in(
+    at_jumps, windows, evenly = ways_in(
         sysid.make_problem(*die, [{"t": t, "die.x": x}, {"t": t, "die.x": x, "die.q": q}], free=free)
     )
+    assert_allclose(np.stack(at_jumps[:-1]), [[bounce, bounce], [np.inf, both[1]]], atol=1e-9)
     assert_allclose(windows[0], [bounce, bounce], atol=1e-9)
     assert np.abs(np.stack(windows[:-1])[:, 1] - both[1]).min() < 1e-9 and windows[-1] == evenly[-1] == np.inf
     assert (np.diff(np.stack(windows[:-1])[:, 1]) < 1.01 * t[-1] / 16).all()
