@@ -403,6 +403,16 @@ def test_starts_that_fit_as_well_widen_an_interval(fit):
     assert same == (fit.parameters, [])
 
 
+def test_an_angle_a_turn_away_is_the_same_motion():
+    disc = {"d": dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 0.0), w=2.0)}
+    t = np.arange(20) / 20
+    angle = 0.4 + 2.0 * t + 1e-3 * np.random.default_rng(0).normal(size=20)
+    found = dr.fit(*dr.scene(disc), {"t": t, "d.angle": angle}, free={"d.angle": dr.real()}, progress=False)
+    turned, other = (np.stack([found.shared, found.shared + more], axis=1) for more in (2 * np.pi, 1.0))
+    assert spanning(found.problem, found.parameters, turned) == (found.parameters, [])
+    assert spanning(found.problem, found.parameters, other)[1]
+
+
 def test_score_and_prediction_of_held_out_records(fit):
     held = many(seed=9)[:2]
     scores = fit.score([dr.Record(r.observations, state=r.state) for r in held])

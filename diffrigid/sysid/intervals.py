@@ -74,6 +74,8 @@ def spanning(
             continue
         about = first_value(problem, slot)
         values = np.stack([np.asarray(slot.kind.value(z, about), float) for z in shared[rows].T])
+        if component(slot.paths[0])[0].endswith(".angle"):  # a turn more is the same motion
+            values = p.value + np.remainder(values - p.value + np.pi, 2 * np.pi) - np.pi
         low, high = values.min(0), values.max(0)
         if ((low < p.low) | (high > p.high)).any():
             out[slot.name] = replace(p, low=np.minimum(p.low, low), high=np.maximum(p.high, high))
