@@ -18,7 +18,7 @@ from diffrigid.sysid.diagnosis import correlations
 from diffrigid.sysid.first_rows import is_begun
 from diffrigid.sysid.intervals import derived, describe, spanning, without_interval
 from diffrigid.sysid.lead_in import is_suspect, ways_in
-from diffrigid.sysid.levenberg import Numbers, Point, best_by_record, better_by_record, levenberg
+from diffrigid.sysid.levenberg import INTERRUPTED, Numbers, Point, best_by_record, better_by_record, levenberg
 from diffrigid.sysid.losses import Loss, Squares
 from diffrigid.sysid.orders import Orders
 from diffrigid.sysid.parameters import Scene
@@ -202,8 +202,8 @@ class Fit:
         z, reach = make_starts(problem, starts, seed), reach_of(problem, range(problem.sizes[0]))
         z = z._replace(shared=jnp.repeat(z.shared[:, :1], starts, axis=1))
         iterations = SCORE_ITERATIONS if problem.own else 0
-        point, _ = levenberg(problem.groups, z, self.loss, iterations, reach)
-        if problem.own and is_suspect(problem, point, self.loss):
+        point, early = levenberg(problem.groups, z, self.loss, iterations, reach)
+        if problem.own and early != INTERRUPTED and is_suspect(problem, point, self.loss):
             point = self._led_in(problem, z, point, reach)
         best = best_by_record(problem.groups, point, self.loss)
         found = [by_column(problem, point, start, in_units=True)[k] for k, start in enumerate(best[: len(scored)])]
@@ -225,7 +225,9 @@ class Fit:
             z = start
             for window in way:
                 groups = with_noise(problem, problem.noise, window).groups
-                found, _ = levenberg(groups, z, self.loss, SCORE_ITERATIONS, reach)
+                found, early = levenberg(groups, z, self.loss, SCORE_ITERATIONS, reach)
+                if early == INTERRUPTED:  # its residuals are of a part
+                    return point
                 z = found.z
             point = better_by_record(self.loss, members, point, found)
             if not is_suspect(problem, point, self.loss):
