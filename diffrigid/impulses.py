@@ -7,7 +7,8 @@ In an interval the momenta p and angular momenta L of all bodies change by
 where z are the impulses at the points of contact, those that the errors of the joints transmit, and those along the
 angle or translation of a joint where it is at a limit, or where its friction or motor holds it at its speed; one that
 does not reach its speed acts with all it has, and is among the forces, as damping is. The z are the smallest (least
-norm: where several share a load, equally).
+norm: where several share a load, equally) that push, with friction within its cone; and rather those of new contacts
+than of those that rested before.
 """
 
 import functools
@@ -32,6 +33,10 @@ from diffrigid.world import World
 SLACK = 1e-3  # [-] of what friction changes in an interval: a rate this close to the speed of a motor is held there
 ROUNDING = 8.0  # times that of a number of the size of the rate
 SOFT = 1e-9  # [-] of the trace, which makes a singular system regular
+RESTED = 0.1  # [-] weight of the impulses of contacts that rested, in the least norm
+OUTSIDE = 1e-6  # [-] of the largest impulse: further out of the cone is out
+LEFT = 0.05  # [-] of the changes may remain for the sake of the cones
+ROWS = 64  # intervals, of which a multiple is looked at
 AT_LIMIT = 2e-3  # [rad], or of a size: a joint this close to its limit rests on it
 
 
@@ -59,10 +64,12 @@ def changes_of(trajectory: Trajectory) -> Changes:
     """Changes of the momenta of all bodies, and what the joints may have to do with them."""
     world, h = trajectory.world, np.diff(trajectory.t)
     dtype, dim = world.bodies.mass.dtype, world.dim
-    state = jax.tree.map(lambda leaf: leaf.astype(dtype), trajectory.state)
-    momenta, forces, made, gyration = (
-        np.asarray(leaf, float) for leaf in _loads(world, state, trajectory.controls, h.astype(dtype))
-    )
+    steps = np.arange(-(-len(h) // ROWS) * ROWS + 1)  # the last again, so that few lengths are compiled
+    state = jax.tree.map(lambda leaf: leaf.astype(dtype)[np.minimum(steps, len(h))], trajectory.state)
+    lasting = np.minimum(steps[:-1], len(h) - 1)
+    controls = jax.tree.map(lambda leaf: leaf[lasting], trajectory.controls)
+    *loads, gyration = (np.asarray(leaf, float) for leaf in _loads(world, state, controls, h.astype(dtype)[lasting]))
+    momenta, forces, made = (leaf[: len(h) + n] for leaf, n in zip(loads, (1, 0, 0), strict=True))
     change = np.diff(momenta, axis=0) - forces
     push = np.linalg.norm(forces[..., :dim], axis=2) + np.linalg.norm(forces[..., dim:], axis=2) / gyration
     ends = ends_of(world.joints)
@@ -73,18 +80,29 @@ def changes_of(trajectory: Trajectory) -> Changes:
     return Changes(change[..., :dim], change[..., dim:], fall, push, joints)
 
 
-def impulses_at(changes: Changes, interval: np.ndarray, ends: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Impulses (M, D) [N s] at M contacts on their first bodies; the second receive the opposite.
+class Touching(NamedTuple):
+    """M contacts, each in one interval."""
 
-    Args:
-        interval: (M,) in which each acts.
-        ends: (2, M) bodies; statics have larger numbers.
-        arms: (2, M, D) [m] from their centres.
+    interval: np.ndarray  # (M,)
+    ends: np.ndarray  # (2, M) bodies; statics have larger numbers
+    arms: np.ndarray  # (2, M, D) [m] from their centres
+    normal: np.ndarray  # (M, D) from the second to the first; zero: unknown
+    friction: np.ndarray  # (M,) [-]
+    new: np.ndarray  # (M,) bool: apart at the start of the interval
+
+
+def impulses_at(changes: Changes, touching: Touching) -> tuple[np.ndarray, np.ndarray]:
+    """Impulses (M, D) [N s] at contacts on their first bodies; the second receive the opposite.
+
+    Returns:
+        those, and the changes of momentum that remain, (T, N, D) [N s]; zero of bodies with joints and no contact.
     """
+    interval, ends, arms = touching[:3]
+    left = np.where(np.isin(np.arange(changes.p.shape[1]), changes.joints.ends)[:, None], 0.0, changes.p)
     found, moving, joints = np.zeros(arms.shape[1:]), changes.p.shape[1], changes.joints
     order, change = np.argsort(interval, kind="stable"), np.concatenate([changes.p, changes.L], axis=2)
-    for rows in np.split(order, np.flatnonzero(np.diff(interval[order])) + 1):
-        k = interval[rows[0]]
+    intervals, firsts = np.unique(interval[order], return_index=True)
+    for k, rows in zip(intervals, np.split(order, firsts[1:]), strict=False):
         together = islands([*ends[:, rows].T.tolist(), *joints.ends.T.tolist()], moving)
         label = np.array([bodies[0] for bodies in together])
         island, of_joints = label[ends[:, rows].min(0)], label[joints.ends.min(0)]  # statics have the larger numbers
@@ -100,10 +118,51 @@ def impulses_at(changes: Changes, interval: np.ndarray, ends: np.ndarray, arms: 
                 _by_points(here(ends[:, chosen]), arms[:, chosen], len(bodies), changes.L.shape[2]),
                 _by_joints(here(joints.ends[:, own]), joints.made[k, own], len(bodies)),
             ], axis=1)  # fmt: skip
-            normal = A @ A.T
-            lam = np.linalg.solve(normal + SOFT * np.trace(normal) * np.eye(len(normal)), change[k, bodies].ravel())
-            found[chosen] = (A.T @ lam)[: chosen.size * arms.shape[2]].reshape(len(chosen), -1)
-    return found
+            found[chosen], rest = _in_cones(A, change[k, bodies].ravel(), *(leaf[chosen] for leaf in touching[3:]))
+            left[k, bodies] = rest.reshape(len(bodies), -1)[:, : arms.shape[2]]
+    return found, left
+
+
+def _in_cones(
+    A: np.ndarray, change: np.ndarray, normal: np.ndarray, mu: np.ndarray, new: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Impulses (C, D) of the first C D columns of A that push and rub within their cones, and what remains of `change`.
+
+    From the least without cones on, contacts that pull are left out, and those that rub too much slide that way; unless
+    this explains less.
+    """
+    count, D = normal.shape
+    known = normal.any(1)
+    ways = [np.eye(D) * (1.0 if first else RESTED) for first in new]
+    others = A[:, count * D :]
+
+    def least() -> tuple[np.ndarray, np.ndarray]:
+        columns = [A[:, c * D : c * D + D] @ way for c, way in enumerate(ways)]
+        B = np.concatenate([*columns, others], axis=1)
+        square, size = B @ B.T, (B**2).sum()
+        lam = np.linalg.solve(square + SOFT * size * np.eye(len(square)), change) if size else 0.0 * change
+        y, ends = B.T @ lam, np.cumsum([way.shape[1] for way in ways])
+        P = np.stack([way @ part for way, part in zip(ways, np.split(y[: ends[-1]], ends[:-1]), strict=True)])
+        return P, change - B @ y
+
+    P, left = first = least()
+    most = np.linalg.norm(left) + LEFT * np.linalg.norm(change)
+    for _ in range(2 * count):
+        push = (P * normal).sum(1)
+        along = P - push[:, None] * normal
+        rub, out = np.linalg.norm(along, axis=1), OUTSIDE * np.abs(P).max()
+        pulls = known & (push < min(-out, 0.5 * push.min()))
+        slides = known & ~pulls & (rub > mu * push + out) & [way.shape[1] == D for way in ways]
+        if not (pulls | slides).any():
+            break
+        for c in np.flatnonzero(pulls):
+            ways[c] = np.zeros((D, 0))
+        for c in np.flatnonzero(slides):
+            ways[c] = (normal[c] + mu[c] * along[c] / rub[c])[:, None] * (1.0 if new[c] else RESTED)
+        P, left = least()
+        if np.linalg.norm(left) > most:
+            return first
+    return P, left
 
 
 def _by_points(ends: np.ndarray, arms: np.ndarray, moving: int, A: int) -> np.ndarray:

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffrigid.convert import known
+from diffrigid.gaps import rotated
 from diffrigid.shapes import UNEVEN, HalfSpace, edges, radius, traced, vertices
 from diffrigid.state import State, rotations
-from diffrigid.touch import rotated
 from diffrigid.world import World, seated, seats
 
 DEEP = 1e-4  # [-] of the smaller size: penetration at the start that is worth a warning

@@ -1,146 +1,209 @@
-"""Gaps between the parts of two convex shapes, for many poses at once. NumPy.
+"""Which shapes touch in each interval of a trajectory: when, at what points, along which normals. NumPy.
 
-A shape is the hull of its corners, rounded. Its parts are corners, sides (in 3D edges; of a disc or sphere one, without
-length), and in 3D faces.
+Those that come together on their free flight from the start of the interval, or lie together through it; corner against
+side or face, and in 3D edge against edge, of the cores.
 """
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from diffrigid.gaps import Convex, gaps, parting_normals, rotated
+from diffrigid.hull import hull_faces
+from diffrigid.impulses import Changes
+from diffrigid.shapes import UNEVEN, Box, HalfSpace, Hull, edges, radius, vertices
+from diffrigid.trajectory import Trajectory
+from diffrigid.world import World
 
-class Convex(NamedTuple):
-    """R shapes of one kind, in body axes from the centres of their bodies; a half space has no corners."""
-
-    corners: np.ndarray | None  # (R, V, D) [m]
-    normal: np.ndarray | None  # (R, D) of a half space
-    rounding: np.ndarray  # (R,) [m]; of a half space its offset
-    sides: tuple  # pairs of corners
-    faces: tuple  # triples of corners, counter-clockwise from outside
-    size: np.ndarray  # (R,) [m] radius that encloses it
-
-    def take(self, rows: np.ndarray) -> "Convex":
-        """Select some rows."""
-        return self._replace(
-            corners=None if self.corners is None else self.corners[rows],
-            normal=None if self.normal is None else self.normal[rows],
-            rounding=self.rounding[rows], size=self.size[rows],
-        )  # fmt: skip
-
-
-OVER = 1e-8  # [-] of an edge: a corner that is no further beside a face is over it
-
-Pose = tuple[np.ndarray, np.ndarray]
+SLOP = 2e-3  # [-] of the smaller size: gap up to which bodies touch
+TOGETHER = 1e-2  # [-] of it: gap up to which other points take part in an impact
+STRUCK = 1e-5  # [-] of the impulse of the forces: a smaller change of momentum is none
+BEYOND = 1.1  # [-] times the sizes,
+FASTER = 1.5  # [-] and times the path at the first speed: what is further apart does not meet
+NO_SIZE = 1e-9  # [m, N s] where there is no size, no force
+BENT = 0.1  # [-] of the path by the forces: a path that deviates more from that of an even force has an impact,
+SUPPORTED = 1.2  # [-] of the impulse of the forces: a support balances them, an impact changes the momentum by more
+ASIDE = 1e-6  # [-] of the smaller size: by so much a body is moved to find a normal, which is the rise of the gap,
+UNIQUE = 0.01  # [-] and has the length 1 to this, or is none
 
 
-def gaps(a: Convex, pose_a: Pose, b: Convex, pose_b: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Signed gaps (M, C) [m] and points (M, C, D) of C candidates for a contact, M poses."""
-    if a.corners is None:
-        return gaps(b, pose_b, a, pose_a)
-    corners_a = placed(a.corners, pose_a)
-    if b.corners is None:
-        return _on_plane(a, corners_a, b, pose_b)
-    corners_b = placed(b.corners, pose_b)
-    if a.corners.shape[2] == 2:
-        found = [(b, _on_sides(corners_a, corners_b, b.sides)), (a, _on_sides(corners_b, corners_a, a.sides))]
+class Touch(NamedTuple):
+    """Contacts of all intervals, in any order; M of them."""
+
+    interval: np.ndarray  # (M,)
+    s: np.ndarray  # (M,) [s] since the start of the interval
+    new: np.ndarray  # (M,) bool: apart at the start of the interval
+    a: np.ndarray  # (M,) colliders
+    b: np.ndarray
+    point: np.ndarray  # (M, D) [m]
+    normal: np.ndarray  # (M, D) from b to a; zero: unknown
+
+
+class Sampled(NamedTuple):
+    """All colliders at the times looked at; those that do not move have no velocity."""
+
+    t: np.ndarray  # (T+1,) [s]
+    x: np.ndarray  # (T+1, N + S, D)
+    q: np.ndarray  # (T+1, N + S, Q)
+    v: np.ndarray  # (T+1, N + S, D)
+    w: np.ndarray  # (T+1, N + S, A)
+    a: np.ndarray  # (T, N + S, D) [m/s^2] before an impact in the interval; even, with a joint or without an impact
+
+
+def touches(world: World, motion: Sampled, changes: Changes) -> Touch:
+    """Contacts of all pairs of shapes, but those with uneven ground."""
+    groups = [group for group in world.pairs if not isinstance(world.shapes[group.shape_b], UNEVEN)]
+    found = [_of_kind(world, group, motion, changes) for group in groups] or [_none(world.dim)]
+    return Touch(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _none(dim: int) -> Touch:
+    none, vectors = np.zeros(0, int), np.zeros((0, dim))
+    return Touch(none, np.zeros(0), none > 0, none, none, vectors, vectors)
+
+
+def sampled(trajectory: Trajectory, changes: Changes) -> Sampled:
+    """All colliders at the times of a trajectory."""
+    state, still = trajectory.state, trajectory.world.statics
+    count, steps = len(trajectory.world.static_names), len(trajectory.t)
+
+    def joined(moving, rest):
+        return np.concatenate([moving, np.broadcast_to(rest, (steps, count, moving.shape[2]))], axis=1)
+
+    x, q = (joined(*both) for both in ((state.x, np.asarray(still.x, float)), (state.q, np.asarray(still.q, float))))
+    h, v, mass = np.diff(trajectory.t)[:, None], state.v, np.asarray(trajectory.world.bodies.mass, float)
+    even = np.diff(v, axis=0) / h[..., None]
+    off = np.linalg.norm(np.diff(state.x, axis=0) - 0.5 * h[..., None] * (v[1:] + v[:-1]), axis=2)
+    hit = (np.linalg.norm(changes.p, axis=2) > SUPPORTED * changes.push) | (off > BENT * h * changes.push / mass)
+    hit &= ~np.isin(np.arange(len(mass)), changes.joints.ends)
+    a = np.where(hit[..., None], changes.fall, even)
+    a = np.concatenate([a, np.zeros((steps - 1, count, x.shape[2]))], axis=1)
+    return Sampled(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0), a)
+
+
+def _of_kind(world: World, group: Any, motion: Sampled, changes: Changes) -> Touch:
+    """Contacts of all pairs of one kind."""
+    sides = _side(world, group.shape_a), _side(world, group.shape_b)
+    a, b, rows = np.array(group.a), np.array(group.b), (np.array(group.row_a), np.array(group.row_b))
+    h, size = np.diff(motion.t), np.minimum(sides[0].size[rows[0]], sides[1].size[rows[1]])
+    change = np.linalg.norm(changes.p, axis=2) + np.linalg.norm(changes.L, axis=2) / max(size.min(), NO_SIZE)
+    struck = change > STRUCK * (changes.push + NO_SIZE)
+    struck = np.concatenate([struck, np.zeros((len(struck), len(world.static_names)), bool)], axis=1)
+    apart = np.linalg.norm(motion.x[:-1, a] - motion.x[:-1, b], axis=2)
+    path = h[:, None] * np.linalg.norm(motion.v[:-1, a] - motion.v[:-1, b], axis=2)
+    reach = BEYOND * (sides[0].size[rows[0]] + sides[1].size[rows[1]]) + FASTER * path
+    k, pair = np.nonzero((struck[:, a] | struck[:, b]) & (apart < reach))
+    slop, row_a, row_b = SLOP * size[pair], rows[0][pair], rows[1][pair]
+
+    def two(s, chosen=slice(None)):
+        """Shapes and poses of both when they have flown freely for s (M,)."""
+        poses = [_flown(motion, k[chosen], body[pair[chosen]], s) for body in (a, b)]
+        return sides[0].take(row_a[chosen]), poses[0], sides[1].take(row_b[chosen]), poses[1]
+
+    def at(s, chosen=slice(None)):
+        """Gaps (M, C) and points (M, C, D) then."""
+        return gaps(*two(s, chosen))
+
+    (start, point), (end, _) = at(np.zeros(len(k))), at(h[k])
+    poses = [(motion.x[k + 1, body[pair]], motion.q[k + 1, body[pair]]) for body in (a, b)]
+    stored, _ = gaps(sides[0].take(row_a), poses[0], sides[1].take(row_b), poses[1])
+    apart, close = start > slop[:, None], end <= slop[:, None]
+    comes, rests = apart & close, ~apart & (close | (stored <= slop[:, None]))
+    s = _meeting(at, h[k], comes)
+    gap, there = at(s)
+    least = np.where(comes, gap, np.inf).min(1, keepdims=True, initial=np.inf)
+    struck = apart & (gap <= np.minimum(2 * slop + TOGETHER * size[pair], least[:, 0] + 4 * slop)[:, None])
+    parts = []
+    for near, place, t in ((struck & comes.any(1)[:, None], there, s), (rests, point, np.zeros_like(s))):
+        row, c = np.nonzero(near & ~_repeated(place, near, 10 * slop))
+        some, of = np.unique(row, return_inverse=True)
+        normal = _normals(two(t[some], some), size[pair[some]], of, c)
+        new = np.full(len(row), near is not rests)
+        parts.append(Touch(k[row], t[row], new, a[pair[row]], b[pair[row]], place[row, c], normal))
+    return Touch(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _normals(two: tuple, size: np.ndarray, of: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Normals (M, D) at candidates c (M,) of the poses `of` (M,): the rise of the gap as the first body moves.
+
+    Where a corner meets a corner that is none; there the normal of a side or face.
+    """
+    a, (x, q), b, pose_b = two
+    rises = []
+    with np.errstate(invalid="ignore"):  # a corner that moves off a face
+        for axis in np.eye(x.shape[1]):
+            step = ASIDE * size[:, None] * axis
+            up, down = (gaps(a, (x + sign * step, q), b, pose_b)[0][of, c] for sign in (1, -1))
+            rises.append((up - down) / (2 * ASIDE * size[of]))
+        rise = np.stack(rises, axis=1)
+        length = np.linalg.norm(rise, axis=1, keepdims=True)
+        return np.where(np.abs(length - 1.0) < UNIQUE, rise / length, parting_normals(*two)[of])
+
+
+def _side(world: World, group: int) -> Convex:
+    """Corners, edges and faces of the rows of one entry of `world.shapes`, from the centres of their bodies."""
+    records, offset, dim = world.shapes[group], world.offsets[group], world.dim
+    shapes = [
+        jax.tree.map(lambda leaf, row=row: np.asarray(leaf)[row], records) for row in range(len(world.owners[group]))
+    ]
+    if isinstance(records, HalfSpace):
+        normal = np.asarray(records.normal, float)
+        return Convex(None, normal, np.asarray(records.offset, float), (), (), np.full(len(normal), np.inf))
+    corners = np.array([vertices(shape, dim) for shape in shapes], float)
+    if offset is not None:
+        turned = corners if offset.q is None else rotated(np.asarray(offset.q, float)[:, None], corners)
+        corners = turned + np.asarray(offset.r, float)[:, None]
+    rounding = np.array([radius(shape) for shape in shapes], float)
+    count = corners.shape[1]
+    if dim == 2:
+        sides = tuple((i, (i + 1) % count) for i in range(count if count > 2 else 1))
+        faces: tuple = ()
     else:
-        crossing, foot, top = _crossing(corners_a, a.sides, corners_b, b.sides)
-        if a.faces and b.faces:  # else the cores do not enter each other
-            inside = _inside(foot, corners_a, a.faces, _inside(top, corners_b, b.faces, np.full(crossing.shape, True)))
-            crossing = np.where(inside, -crossing, crossing)
-        found = [(b, (crossing, foot, top))]
-        found += [(b, _on_faces(corners_a, corners_b, b.faces))] if b.faces else []
-        found += [(a, _on_faces(corners_b, corners_a, a.faces))] if a.faces else []
-    rounding, parts = (a.rounding + b.rounding)[:, None], []
-    for owner, (gap, foot, top) in found:
-        share = np.minimum(owner.rounding[:, None] / np.maximum(np.abs(gap), 1e-12), 1.0)
-        parts.append((gap - rounding, foot + share[..., None] * (top - foot)))
-    gap, point = (np.concatenate(both, axis=1) for both in zip(*parts, strict=True))
-    return gap, point
+        sides = edges(shapes[0], dim) or ((0, 0),)
+        faces = (records.faces or ()) if isinstance(records, Hull) else _box_faces() if count > 3 else ()
+    return Convex(corners, None, rounding, sides, faces, np.linalg.norm(corners, axis=2).max(1) + rounding)
 
 
-def placed(points: np.ndarray, pose: Pose) -> np.ndarray:
-    """Points (M, V, D) of bodies at poses (M, D), (M, Q), in the world."""
-    return pose[0][:, None] + rotated(pose[1][:, None], points)
+@functools.cache
+def _box_faces() -> tuple:
+    """Faces of any box, one without thickness included."""
+    return tuple(hull_faces(np.array(vertices(Box(half=(1.0, 1.0, 1.0)), 3), float)))
 
 
-def rotated(q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Vectors (..., D) from body to world axes; q (..., Q) and r broadcast."""
-    if q.shape[-1] == 2:
-        c, s, x, y = q[..., 0], q[..., 1], r[..., 0], r[..., 1]
-        return np.stack([c * x - s * y, s * x + c * y], axis=-1)
-    t = 2.0 * np.cross(q[..., 1:], r)
-    return r + q[..., :1] * t + np.cross(q[..., 1:], t)
+def _flown(motion: Sampled, k: np.ndarray, body: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (M, D), (M, Q) after a free flight of s (M,) without torques, which is near enough within an interval."""
+    s = s[:, None]
+    x = motion.x[k, body] + s * (motion.v[k, body] + 0.5 * s * motion.a[k, body])
+    q, w = motion.q[k, body], s * motion.w[k, body]
+    if q.shape[1] == 2:
+        c, u = np.cos(w[:, 0]), np.sin(w[:, 0])
+        return x, np.stack([c * q[:, 0] - u * q[:, 1], u * q[:, 0] + c * q[:, 1]], axis=1)
+    half = 0.5 * np.linalg.norm(w, axis=1, keepdims=True)
+    p0, p = np.cos(half), 0.5 * w * np.sinc(half / np.pi)
+    first = p0 * q[:, :1] - (p * q[:, 1:]).sum(1, keepdims=True)
+    return x, np.concatenate([first, p0 * q[:, 1:] + q[:, :1] * p + np.cross(p, q[:, 1:])], axis=1)
 
 
-def _on_plane(a: Convex, corners: np.ndarray, b: Convex, pose: Pose):
-    assert b.normal is not None
-    normal = rotated(pose[1], b.normal)
-    gap = ((corners - pose[0][:, None]) * normal[:, None]).sum(2) - (b.rounding + a.rounding)[:, None]
-    return gap, corners - (gap + a.rounding[:, None])[..., None] * normal[:, None]
+def _meeting(at, h: np.ndarray, comes: np.ndarray) -> np.ndarray:
+    """Times (M,) at which the least gap of those that come becomes zero, by bisection; 0 where none comes."""
+    s, chosen = np.zeros(len(h)), np.flatnonzero(comes.any(1))
+    low, high = np.zeros(len(chosen)), h[chosen].copy()
+    for _ in range(14 if len(chosen) else 0):
+        middle = (low + high) / 2
+        closed = (comes[chosen] & (at(middle, chosen)[0] <= 0)).any(1)
+        low, high = np.where(closed, low, middle), np.where(closed, middle, high)
+    s[chosen] = high
+    return s
 
 
-def _on_sides(corners: np.ndarray, others: np.ndarray, sides: tuple):
-    """For each corner and the nearest side of the other in 2D: signed distance (M, V), foot on the side, corner."""
-    start, end = (others[:, [side[n] for side in sides]] for n in (0, 1))
-    along = (end - start)[:, None]
-    to = corners[:, :, None] - start[:, None]
-    share = np.clip((to * along).sum(3) / np.maximum((along**2).sum(3), 1e-30), 0.0, 1.0)
-    foot = start[:, None] + share[..., None] * along
-    distance = np.linalg.norm(corners[:, :, None] - foot, axis=3)
-    nearest = distance.argmin(2)[..., None]
-    inside = (along[..., 0] * to[..., 1] > along[..., 1] * to[..., 0]).all(2) & (len(sides) > 2)
-    gap = np.take_along_axis(distance, nearest, 2)[..., 0] * np.where(inside, -1.0, 1.0)
-    return gap, np.take_along_axis(foot, nearest[..., None], 2)[:, :, 0], corners
-
-
-def _on_faces(corners: np.ndarray, others: np.ndarray, faces: tuple):
-    """As `_on_sides` for each corner and the nearest face that it is over in 3D; infinite distance if over none."""
-    (p, r, s), normal = _planes(others, faces)
-    height = ((corners[:, :, None] - p[:, None]) * normal[:, None]).sum(3)
-    foot = corners[:, :, None] - height[..., None] * normal[:, None]
-    over = np.ones(height.shape, bool)
-    for one, two in ((p, r), (r, s), (s, p)):
-        inward = np.cross(normal, two - one)
-        beside = -OVER * ((two - one) ** 2).sum(2)[:, None]
-        over &= ((foot - one[:, None]) * inward[:, None]).sum(3) >= beside
-    # Inside, the face that is least deep; outside, the one it stands over.
-    inside = (height < 0).all(2, keepdims=True)
-    gap = np.where(over & (inside | (height >= 0)), np.abs(height), np.inf)
-    nearest = gap.argmin(2)[..., None]
-    least = np.take_along_axis(gap, nearest, 2)[..., 0] * np.where(inside[..., 0], -1.0, 1.0)
-    return least, np.take_along_axis(foot, nearest[..., None], 2)[:, :, 0], corners
-
-
-def _planes(corners: np.ndarray, faces: tuple) -> tuple[list[np.ndarray], np.ndarray]:
-    """Corners of faces (M, F, 3), three for each, and their normals (M, F, 3)."""
-    p, r, s = (corners[:, [face[n] for face in faces]] for n in range(3))
-    normal = np.cross(r - p, s - p)
-    return [p, r, s], normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-30)
-
-
-def _inside(points: np.ndarray, corners: np.ndarray, faces: tuple, asked: np.ndarray) -> np.ndarray:
-    """Whether points (M, C, 3) are inside a shape, bool (M, C); False where not `asked` (M, C)."""
-    row, column = np.nonzero(asked)
-    (on, *_), normal = _planes(corners, faces)
-    height = ((points[row, column][:, None] - on[row]) * normal[row]).sum(2)
-    inside = np.zeros_like(asked)
-    inside[row, column] = (height < 0).all(1)
-    return inside
-
-
-def _crossing(corners_a: np.ndarray, sides_a: tuple, corners_b: np.ndarray, sides_b: tuple):
-    """For every two edges in 3D: distance (M, E F), and the nearest points on b and on a."""
-    (p, d), (r, e) = ((c[:, [s[0] for s in sides]], c[:, [s[1] for s in sides]] - c[:, [s[0] for s in sides]])
-                      for c, sides in ((corners_a, sides_a), (corners_b, sides_b)))  # fmt: skip
-    p, d, r, e = p[:, :, None], d[:, :, None], r[:, None], e[:, None]
-    dd, ee, de = (d * d).sum(3), (e * e).sum(3), (d * e).sum(3)
-    between = p - r
-    dp, ep = (d * between).sum(3), (e * between).sum(3)
-    det = dd * ee - de**2
-    s = np.clip(np.where(det > 1e-12 * dd * ee, (de * ep - ee * dp) / np.maximum(det, 1e-30), 0.5), 0, 1)
-    u = np.clip((de * s + ep) / np.maximum(ee, 1e-30), 0, 1)
-    s = np.clip((de * u - dp) / np.maximum(dd, 1e-30), 0, 1)
-    top, foot = p + s[..., None] * d, r + u[..., None] * e
-    shape = (len(corners_a), len(sides_a) * len(sides_b), 3)
-    return np.linalg.norm(top - foot, axis=3).reshape(shape[:2]), foot.reshape(shape), top.reshape(shape)
+def _repeated(point: np.ndarray, near: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Whether candidates (M, C) are at the place of an earlier one of the same pair."""
+    repeated, several = np.zeros_like(near), np.flatnonzero(near.sum(1) > 1)
+    for row in several:
+        chosen = np.flatnonzero(near[row])
+        places = point[row, chosen]
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+        repeated[row, chosen] = np.tril(apart < distance[row], -1).any(1)
+    return repeated

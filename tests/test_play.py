@@ -236,6 +236,75 @@ def test_impulse_between_two_bodies_is_found_at_corner_edge_and_round(dim):
         np.testing.assert_allclose(table[:, 2].mean(), 0.0035, atol=1e-3)
 
 
+FLOOR, WALL = dr.Static(dr.HalfSpace(normal=(0.0, 1.0))), dr.Static(dr.HalfSpace(normal=(-1.0, 0.0), offset=-1.0))
+DISC, SQUARE = dr.Disc(radius=0.1), dr.Box(half=(0.1, 0.1))
+
+
+def total_impulses(bodies, steps=20, **law):
+    """Times of the impacts of each pair, and their sum (D,), at 60 Hz."""
+    found, total = dr.contacts(dr.rollout(*dr.scene(bodies, **law), dt=1 / 60, steps=steps)), {}
+    for k in np.flatnonzero(found.impact):
+        times, P = total.get((pair := f"{found.names[found.a[k]]}-{found.names[found.b[k]]}"), ([], 0.0))
+        total[pair] = ([*times, found.t[k]], P + found.impulse[k])
+    return {pair: (np.unique(np.round(times, 5)), P) for pair, (times, P) in total.items()}
+
+
+def test_two_walls_struck_within_a_step_have_their_own_impulses():
+    """A disc that slips on the floor, and with friction sticks to the wall (I = m r^2 / 2)."""
+    for mu, e in ((0.0, 1.0), (0.1, 0.6)):
+        bodies = {"a": dr.Body(DISC, mass=1.0, x=(0.804, 0.191), v=(1.0, -1.0)), "floor": FLOOR, "wall": WALL}
+        found = total_impulses(bodies, steps=12, friction=mu, restitution=e)
+        slows = mu * (1 + e)
+        u, rim = 1.0 - slows, e - 2 * slows  # the speed to the wall, and of the rim along it
+        (floor,), on_floor = found["a-floor"]
+        (wall,), on_wall = found["a-wall"]
+        np.testing.assert_allclose(on_floor, [-slows, 1 + e], atol=1e-6)
+        np.testing.assert_allclose(on_wall, [-(1 + e) * u, -min(mu * (1 + e) * u, rim / 3)], atol=1e-6)
+        np.testing.assert_allclose([floor, wall], [0.091, 0.091 + (0.096 - 0.091) / u], atol=1e-5)
+
+
+def test_impacts_that_follow_each_other_within_a_step_are_all_found():
+    """A cradle: only the first two come together on the free flight from the start of the step."""
+    row = {name: dr.Body(DISC, mass=1.0, x=(0.202 * k - 0.048 * (k == 0), 0.0)) for k, name in enumerate("abcd")}
+    row["a"] = dr.replace(row["a"], v=(3.0, 0.0))
+    found = total_impulses(row, steps=3, restitution=0.8)
+    u, t = 3.0, 0.05 / 3.0
+    for pair in ("a-b", "b-c", "c-d"):
+        np.testing.assert_allclose(found[pair][1], [-0.5 * 1.8 * u, 0.0], atol=1e-6)
+        assert abs(found[pair][0][0] - t) < 1e-4
+        u *= 0.9
+        t += 0.002 / u
+
+
+def test_what_slides_into_something_pushes_it_and_not_the_floor():
+    """The floor can only change momenta by its friction, and without any by nothing."""
+    for mu in (0.0, 0.2):
+        bodies = {
+            "a": dr.Body(SQUARE, mass=1.0, x=(0.0, 0.1), v=(2.0, 0.0)),
+            "b": dr.Body(SQUARE, mass=2.0, x=(0.25, 0.1)),
+            "floor": FLOOR,
+        }
+        ((_, P),) = total_impulses(bodies, gravity=(0.0, -G), restitution=0.5, friction=mu).values()
+        u = np.sqrt(4.0 - 2 * mu * G * 0.05)
+        np.testing.assert_allclose(P, [-2 / 3 * 1.5 * u, 0.0], atol=mu * 3 * G / 60 + 1e-9)
+
+
+def test_a_corner_that_lands_beside_one_that_touches_is_found():
+    """A box falls onto one corner and tips onto the other in the next step; all impulses of the floor lift it."""
+    box = dr.Body(dr.Box(half=(0.1, 0.06)), mass=1.0, x=(0.0, 0.5), v=(1.0, 0.0), w=5.0)
+    world, state = dr.scene({"a": box, "floor": FLOOR}, gravity=(0.0, -G))
+    run = dr.rollout(world, state, dt=1 / 60, steps=60)
+    found = dr.contacts(run)
+    change = np.diff(run.state.v[:, 0], axis=0) + np.array([0.0, G / 60])
+    given = np.zeros_like(change)
+    within = np.where(
+        found.impact, found.t - 1e-9, found.t + 1e-9
+    )  # an impact may end an interval, and rest begins one
+    np.add.at(given, np.searchsorted(run.t, within) - 1, found.impulse)
+    assert (change[:, 1] > 0.01).sum() > 40 and found.impact.sum() == 4
+    np.testing.assert_allclose(given, change, atol=3e-5)
+
+
 @pytest.mark.parametrize("step", [0.01, 0.1])
 def test_impulse_of_edge_on_edge(step):
     """Cubes on edges that cross at right angles: they are found also where the free flight goes deep into the other."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from diffrigid import state as of_state
 from diffrigid.convert import at_least_one, positive
-from diffrigid.touch import rotated
+from diffrigid.gaps import rotated
 from diffrigid.trajectory import Trajectory, checked
 from diffrigid.view.frames import energies, turns
 from diffrigid.view.outline import outline

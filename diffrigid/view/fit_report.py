@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diffrigid.impacts import contacts
+from diffrigid.impacts import meetings
 from diffrigid.sysid.columns import Series
 from diffrigid.sysid.covariance import TINY
 from diffrigid.sysid.intervals import number_names
@@ -105,7 +105,7 @@ def _residuals(fit: "Fit", motions: Sequence[Trajectory]) -> Section:
 
 def impacts(motion: Trajectory) -> np.ndarray:
     """Times [s] of the impacts of a motion."""
-    found = contacts(motion, np.zeros(0))
+    found = meetings(motion, np.zeros(0))
     return np.unique(np.round(found.t[found.impact], 6))
 
 

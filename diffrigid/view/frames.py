@@ -13,12 +13,12 @@ import numpy as np
 
 from diffrigid import impacts
 from diffrigid.forces import Gravity, SpringDamper
+from diffrigid.gaps import rotated
 from diffrigid.joints import Distance
 from diffrigid.shapes import Box, Capsule, Disc, HalfSpace, HeightField, Profile, Shape, Sphere, with_topology
 from diffrigid.state import State, kinetic_energy
 from diffrigid.sysid.columns import columns
 from diffrigid.sysid.sensors import Part
-from diffrigid.touch import rotated
 from diffrigid.trajectory import Trajectory
 from diffrigid.view.outline import nodes
 from diffrigid.world import World, seated, seats
@@ -83,7 +83,7 @@ def poses(trajectory: Trajectory) -> np.ndarray:
 
 def contacts(trajectory: Trajectory, t_drawn: np.ndarray) -> np.ndarray:
     """Contacts by time: t [s], 1 for impact or 0 for rest, point (D) [m], impulse (D) [N s] on a body that moves."""
-    found = impacts.contacts(trajectory, t_drawn)
+    found = impacts.meetings(trajectory, t_drawn)
     return np.column_stack([found.t, found.impact, found.point, found.impulse])
 
 
