@@ -5,10 +5,10 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from diffrigid import joint_motion
-from diffrigid.convert import nearest
 from diffrigid.forces import Gravity
 from diffrigid.joints import Revolute
 from diffrigid.pytree import array_fields
+from diffrigid.spelling import nearest
 from diffrigid.state import COEFFICIENTS
 from diffrigid.world import Seat, World, seats
 

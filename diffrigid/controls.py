@@ -9,8 +9,9 @@ from typing import Any
 import jax
 from jax import lax
 
-from diffrigid.convert import nearest, numbers
+from diffrigid.convert import numbers
 from diffrigid.forces import FORCES, Force, Torque
+from diffrigid.spelling import nearest
 
 
 def controlled(forces: tuple, axis: int = 0) -> dict[str, int]:

@@ -4,8 +4,7 @@ Functions that check take the name of the argument first, for their messages. Kn
 `jit` even a constant is traced as soon as JAX holds it.
 """
 
-import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,12 +21,6 @@ FEW = 16  # numbers that a message shows in full
 NO_THICKNESS = 1e-9  # [-] of the largest principal inertia: a body with a smaller one has no thickness
 
 Numbers = Any  # np.ndarray where known, Array where traced
-
-
-def nearest(name: str, names: Iterable[str]) -> str:
-    """Text that lists the names most similar to one that does not exist."""
-    near = difflib.get_close_matches(str(name), sorted(names), n=3, cutoff=0.4)
-    return f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(sorted(names))}"
 
 
 def known(fn: Callable, *args: Any) -> Any:

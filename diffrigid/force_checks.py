@@ -7,9 +7,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from diffrigid.convert import nearest, numbers
+from diffrigid.convert import numbers
 from diffrigid.pytree import map_arrays, refuse_missing, replace, undeclared_fields
 from diffrigid.shapes import traced
+from diffrigid.spelling import nearest
 from diffrigid.state import axis_sizes
 
 
@@ -38,7 +39,8 @@ def force_of(name: str, force: Any, bodies: list[str], dim: int) -> Any:
     if undeclared := undeclared_fields(force):
         raise ValueError(
             f"{name}.{undeclared[0]} is not declared: write a force of your own with `array` and `static` of "
-            f"diffrigid.pytree, @pytree class {type(force).__name__}: {undeclared[0]}: Leaf = array()"
+            f"diffrigid.pytree, @pytree class {type(force).__name__}: {undeclared[0]}: Leaf = array(); arrays of a "
+            "dict or a tuple are a field each"
         )
     if not isinstance(getattr(force, "control", None), str | None):
         raise ValueError(f"{name}.control is {force.control!r}: expected the name of a control, or None")

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from diffrigid.collide import COLLIDERS
-from diffrigid.convert import nearest
 from diffrigid.pytree import align_all
 from diffrigid.shapes import UNEVEN
+from diffrigid.spelling import nearest
 from diffrigid.state import State, at_place
 from diffrigid.step import floats
 from diffrigid.world import World, check, seated, seats

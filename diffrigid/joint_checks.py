@@ -11,12 +11,13 @@ import numpy as np
 from jax import Array
 
 from diffrigid.constraints import joint_rates, placed
-from diffrigid.convert import TYPED, known, nearest, numbers, positive, stack, unit_quaternion
+from diffrigid.convert import TYPED, known, numbers, positive, stack, unit_quaternion
 from diffrigid.joints import JOINTS, Distance, Pose, Prismatic, Revolute, places, separation
 from diffrigid.linkage import ends_of, to_sides, twists_of
 from diffrigid.numerics import norm
 from diffrigid.pytree import array_fields, letters_of, refuse_missing, replace
 from diffrigid.shapes import traced
+from diffrigid.spelling import nearest
 from diffrigid.state import State, rotations
 
 if TYPE_CHECKING:

@@ -12,8 +12,10 @@ from diffrigid.moments import assembly_properties, volume_properties
 from diffrigid.pytree import Number, Vector
 from diffrigid.shape_checks import check_shape
 from diffrigid.shapes import BOUNDLESS, Shape, dimension, traced
+from diffrigid.spelling import in_words
 
 
+@in_words
 @dataclass(frozen=True)
 class Part:
     """One of several shapes of a body, at its place.

@@ -18,6 +18,8 @@ from typing import Any, TypeVar, dataclass_transform
 import jax
 import numpy as np
 
+from diffrigid.spelling import in_words
+
 replace = dataclasses.replace
 
 Leaf = Any  # a field that a user fills with a number or a tuple, and `scene` with an array
@@ -55,7 +57,7 @@ def pytree(cls: type[Record]) -> type[Record]:
     made.__annotations__ = {**cls.__annotations__, "_class": str}
     made._class = dataclasses.field(default=cls.__qualname__, repr=False, kw_only=True, metadata={"static": True})
     made = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(made)
-    fields = dataclasses.fields(made)
+    fields = dataclasses.fields(in_words(made))
     meta = [f.name for f in fields if f.metadata.get("static")]
     data = [f.name for f in fields if f.name not in meta]
     return jax.tree_util.register_dataclass(made, data_fields=data, meta_fields=meta)
@@ -128,7 +130,9 @@ def undeclared_fields(record: Any) -> list[str]:
 
 
 def _holds_records(value: Any) -> bool:
-    return value is None or isinstance(value, tuple | dict) or dataclasses.is_dataclass(value)
+    if isinstance(value, tuple | dict):
+        return all(map(_holds_records, value.values() if isinstance(value, dict) else value))
+    return value is None or dataclasses.is_dataclass(value)
 
 
 def array_fields(record: Any) -> list[str]:

@@ -20,11 +20,11 @@ from jax import Array
 
 from diffrigid.collide import PairGroup
 from diffrigid.contact import Contact
-from diffrigid.convert import nearest
 from diffrigid.forces import FORCES
 from diffrigid.joints import JOINTS
 from diffrigid.scene_file import read_scene
 from diffrigid.shapes import SHAPES, traced
+from diffrigid.spelling import nearest
 from diffrigid.state import Bodies, State
 from diffrigid.world import Offset, Statics, World, check
 

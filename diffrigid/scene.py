@@ -15,7 +15,6 @@ from diffrigid.convert import (
     angular_velocity,
     mass_and_inertia,
     materials,
-    nearest,
     numbers,
     orientation,
     stack,
@@ -28,6 +27,7 @@ from diffrigid.parts import Part, check_shapes, dimensions, pieces_of, solid_of
 from diffrigid.pytree import Number, Vector, map_arrays, refuse_missing
 from diffrigid.shape_records import contact_count, looking_around, stack_shapes
 from diffrigid.shapes import BOUNDLESS, Shape, traced
+from diffrigid.spelling import in_words, nearest
 from diffrigid.state import COEFFICIENTS, Bodies, State, rotations
 from diffrigid.world import Statics, World
 
@@ -36,6 +36,7 @@ RESERVED = (*COEFFICIENTS, "contact")  # paths, or the first part of one; and "g
 MOST = 1000  # sweeps, or neighbours
 
 
+@in_words
 @dataclass(frozen=True)
 class Body:
     """A moving body, and its initial state.
@@ -75,6 +76,7 @@ class Body:
     spinning_friction: Number | None = None
 
 
+@in_words
 @dataclass(frozen=True)
 class Static:
     """A shape that does not move, its origin at x [m], turned by angle [rad] (2D) or q.

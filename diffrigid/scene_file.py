@@ -64,10 +64,11 @@ from typing import Any
 
 from diffrigid import forces, joints, paths, shapes, sysid
 from diffrigid.contact import Contact
-from diffrigid.convert import nearest, numbers
+from diffrigid.convert import numbers
 from diffrigid.models import load_mjcf, load_urdf
 from diffrigid.parts import Part
 from diffrigid.scene import Body, Static, scene
+from diffrigid.spelling import nearest
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.world import World
 

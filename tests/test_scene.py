@@ -108,6 +108,23 @@ def test_mistakes_are_named(mistake, monkeypatch):
         dr.scene(bodies, **options)
 
 
+CALLS = {
+    r"Gravity takes nothing without a name: Gravity\(g=\.\.\.\)": lambda: dr.Gravity((0.0, -9.81)),
+    r"Body takes only shape without a name: Body\(shape, mass=\.\.\.,": lambda: dr.Body(dr.Disc(radius=0.1), 1.0),
+    r"Box has no 'size': there are half": lambda: dr.Box(size=(1.0, 1.0)),
+    r"Revolute has no 'anchor': did you mean 'anchor_b' or 'anchor_a'\?": lambda: dr.Revolute("a", anchor=(0.0, 0.0)),
+    r"Record has no 'strat': did you mean .*'start'": lambda: dr.Record({}, strat=1.0),
+    r"Disc lacks radius: Disc\(radius=\.\.\.\)": lambda: dr.Disc(),
+    r"Marker: body is given twice": lambda: dr.Marker("a", body="b"),
+}
+
+
+@pytest.mark.parametrize("message", CALLS)
+def test_a_record_says_how_it_is_written(message):
+    with pytest.raises(TypeError, match=message):
+        CALLS[message]()
+
+
 def one_ball():
     return dr.scene({"ball": ball()}, gravity=(0.0, -9.81))
 

@@ -261,6 +261,8 @@ class Undeclared:
 def test_a_force_says_how_to_declare_its_numbers():
     with pytest.raises(ValueError, match=r"air.k is not declared: .*k: Leaf = array\(\)"):
         dr.scene({"ball": PUCK}, forces={"air": Undeclared(k=0.1)})
+    with pytest.raises(ValueError, match=r"air.k is not declared: .*arrays of a dict or a tuple are a field each"):
+        dr.scene({"ball": PUCK}, forces={"air": Undeclared(k={"layer": np.ones(2)})})
 
 
 @pytree

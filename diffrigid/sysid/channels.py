@@ -13,8 +13,9 @@ import numpy as np
 from diffrigid import joint_motion
 from diffrigid.catalogue import component
 from diffrigid.controls import controlled
-from diffrigid.convert import nearest, numbers, unit_quaternion
+from diffrigid.convert import numbers, unit_quaternion
 from diffrigid.pytree import array_fields, letters_of, replace
+from diffrigid.spelling import nearest
 from diffrigid.state import State, axis_sizes
 from diffrigid.sysid.sensors import Channel, Component, Function, JointPart, Part, is_turn, seen
 from diffrigid.world import World

@@ -10,7 +10,7 @@ import numpy as np
 
 from diffrigid.catalogue import component
 from diffrigid.controls import controlled
-from diffrigid.convert import nearest
+from diffrigid.spelling import nearest
 from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.sensors import Channel, Homography, Marker, Part, Pinhole
 from diffrigid.world import World

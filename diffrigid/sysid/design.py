@@ -10,7 +10,8 @@ import numpy as np
 
 from diffrigid.catalogue import component, unit
 from diffrigid.controls import controlled
-from diffrigid.convert import at_least_one, nearest
+from diffrigid.convert import at_least_one
+from diffrigid.spelling import nearest
 from diffrigid.state import State
 from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.columns import as_floats, as_times, check_mapping

@@ -9,6 +9,7 @@ import numpy as np
 
 from diffrigid.controls import controlled
 from diffrigid.convert import known_number, positive
+from diffrigid.spelling import in_words
 from diffrigid.state import State
 from diffrigid.sysid.columns import Series, check_mapping, columns, odd_places, odd_speeds
 from diffrigid.sysid.free import as_given
@@ -20,6 +21,7 @@ SAME_TIME = 1e-9  # [s] times of different columns that are this close are the s
 MEDIAN = 0.6745  # of the absolute values of normal noise, over its standard deviation
 
 
+@in_words
 @dataclass(frozen=True)
 class Record:
     """One measured run, where several are fitted together.
