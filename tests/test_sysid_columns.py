@@ -18,7 +18,8 @@ from diffrigid import sysid
 from diffrigid.state import rotations
 from diffrigid.step import steps_in
 from diffrigid.sysid.channels import channel_of
-from diffrigid.sysid.columns import columns, read_csv
+from diffrigid.sysid.columns import columns
+from diffrigid.sysid.csv_file import read_csv
 from diffrigid.sysid.parameters import channel_paths
 from diffrigid.sysid.sensors import difference, predict
 from diffrigid.sysid.setup import make_problem
@@ -251,6 +252,36 @@ def test_columns_may_have_times_of_their_own():
     slow = T[::2] + 0.03
     series, *_ = columns(WORLD, {"t": T, "cue.x": np.zeros((6, 2)), "ball.x": (slow, np.ones((3, 2)))}, {})
     assert_allclose([s.t[-1] for s in series], [T[-1], slow[-1]])
+
+
+def test_components_may_have_times_and_noise_of_their_own():
+    """Of one column: the fit is that of the whole column with NaN where a component was not measured."""
+    t_x, t_y = np.array([0.0, 0.1, 0.2, 0.4]), np.array([0.0, 0.2, 0.3])
+    parts = {"ball.x[0]": (t_x, 4.0 + 0 * t_x), "ball.x[1]": (t_y, 6.0 + t_y)}
+    ((series,), _, _) = columns(WORLD, parts, {})
+    assert_allclose(series.t, [0.0, 0.1, 0.2, 0.3, 0.4])
+    assert_allclose(series.values, [[4, 6], [4, np.nan], [4, 6.2], [np.nan, 6.3], [4, np.nan]])
+    ((mixed,), _, _) = columns(WORLD, {"t": t_x, "ball.x[0]": 0 * t_x, "ball.x[1]": parts["ball.x[1]"]}, {})
+    assert_allclose(mixed.t, series.t)
+    free = {"ball.v": dr.real()}
+    noise = {"ball.x[0]": 0.1, "ball.x[1]": np.array([0.2, 0.2, 0.2, 0.3, 0.3])}
+    whole = np.stack([np.full(5, 0.1), noise["ball.x[1]"]], axis=1)
+    as_parts = make_problem(WORLD, STATE, parts, free=free, noise=noise)
+    at_once = make_problem(WORLD, STATE, {"t": series.t, "ball.x": series.values}, free=free, noise={"ball.x": whole})
+    for one, other in zip(as_parts.groups, at_once.groups, strict=True):
+        assert_array_equal(one.data.weights["ball.x"], other.data.weights["ball.x"])
+    alone = make_problem(WORLD, STATE, {"t": t_y, "ball.x[1]": 6.0 + t_y}, free=free, noise={"ball.x[1]": 0.2})
+    assert alone.groups[0].data.weights["ball.x"].max() == 5.0
+    for wrong, message in (
+        ({"ball.x[0]": 0.1}, r"noise: ball.x\[1\] has none: give it too"),
+        ({"ball.x[0]": 0.1, "ball.x": 0.1}, "both 'ball.x' and 'ball.x\\[0\\]' are given"),
+        ({"ball.x[2]": 0.1}, r"noise\['ball.x\[2\]'\]: ball.x has 2 numbers"),
+        ({"ball.x[0]": (0.1, 0.2), "ball.x[1]": 0.1}, r"has shape \(2,\), expected a number or \(5,\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_problem(WORLD, STATE, parts, free=free, noise=wrong)
+    with pytest.raises(ValueError, match=r"ball.x'\]\[1\] has shape \(2,\), expected \(3,\) like its times"):
+        columns(WORLD, parts | {"ball.x[1]": (t_y, t_y[:2])}, {})
 
 
 GOOD = {"t": T, "cue.x": np.zeros((6, 2))}

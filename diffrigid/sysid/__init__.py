@@ -2,7 +2,7 @@
 
 To read it, in the order of a fit; `fit.py` runs it:
 
-    what was measured     columns.py, records.py, sensors.py, channels.py, times.py
+    what was measured     columns.py, csv_file.py, records.py, sensors.py, channels.py, times.py
     what is free          free.py, charts.py (kinds), parameters.py (where they are); losses.py
     the problem           setup.py, first_rows.py, problem.py (from z to residuals), clocks.py, points.py (back)
     solvers               levenberg.py, gradient.py, vector.py (for any other); segments.py for long records
@@ -16,8 +16,8 @@ of each record, m residuals.
 """
 
 from diffrigid.sysid.charts import direction, inertia, rotation, shares
-from diffrigid.sysid.columns import read_csv
 from diffrigid.sysid.covariance import bootstrap, from_jacobian, sandwich
+from diffrigid.sysid.csv_file import read_csv
 from diffrigid.sysid.design import best_launch, blind_spots, expected_intervals
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.free import each, interval, positive, prior, real, through

@@ -1,6 +1,5 @@
-"""Measured columns by name, from a dictionary, a table or a CSV file, checked."""
+"""Measured columns by name, from a dictionary, a table or a file, checked."""
 
-import csv
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +9,8 @@ import numpy as np
 
 from diffrigid.catalogue import component
 from diffrigid.controls import controlled
-from diffrigid.spelling import nearest
 from diffrigid.sysid.channels import channel_of
+from diffrigid.sysid.csv_file import is_number, read_csv
 from diffrigid.sysid.sensors import Channel, Homography, Marker, Part, Pinhole
 from diffrigid.world import World
 
@@ -37,7 +36,7 @@ def columns(
     Args:
         observations: a mapping or a table (anything with `columns`), or the path of a CSV file. "t" (K,) [s], and by
             name (K,) or (K, size), NaN where missing; or a pair (t, values) for a column with times of its own. A
-            component stands alone as "ball.x[0]".
+            component stands alone as "ball.x[0]", which may be such a pair too.
         observe: what a column observes if it is not named for that; None: it is left out.
     """
     check_mapping("observe", observe)
@@ -46,15 +45,19 @@ def columns(
     check_mapping(where, table)
     shared = None if "t" not in table else as_times(table.pop("t"), f'{where}["t"]')
     gathered = _gather(table)
-    if shared is None and not any(isinstance(values, tuple) for values in gathered.values()):
+    if shared is None and not any(isinstance(values, tuple) for values in table.values()):
         raise ValueError(f'{where}: expected a column "t" of times [s], got {list(table)}; rename yours, {{"t": ...}}')
     found, channels, controls, sizes = [], {}, [], controlled(world.forces)
     for name, values in gathered.items():
-        if isinstance(values, tuple) and len(values) == 2:
+        if isinstance(values, dict):
+            t, values = _at_all_times(values, shared, f"{where}[{name!r}]")
+        elif isinstance(values, tuple) and len(values) == 2:
             t, values = as_times(values[0], f"{where}[{name!r}]"), values[1]
         elif shared is not None:
             t = shared
         else:
+            t = None
+        if t is None:
             raise ValueError(f'{where}: expected a column "t" of times [s], got {sorted(gathered)}')
         if name in sizes:
             controls.append(Series(name, t, _filled(values, len(t), sizes[name], name, where, world)))
@@ -70,64 +73,6 @@ def columns(
     if not found:
         raise ValueError(f"{where}: nothing is measured: expected a column beside the times")
     return tuple(found), channels, tuple(controls)
-
-
-def read_csv(
-    path: str | Path, left_out: Collection[str] = (), only: Mapping[str, str] | None = None
-) -> dict[str, np.ndarray]:
-    """Read the columns of a file with one line of names, as `fit` does; an empty cell is a missing value.
-
-    Between columns are commas, or semicolons or tabs where the names have these; numbers may then have decimal commas.
-
-    Args:
-        left_out: names of columns that may hold anything.
-        only: names of the columns that are read, and what they are for, for messages; None: all.
-
-    Raises:
-        ValueError: what is not numbers under one line of names.
-        OSError: there is no such file.
-
-    Example:
-        >>> Path("drop.csv").write_text("time;height_mm\\n0,5;1250,0\\n0,6;1193,5\\n") > 0
-        True
-        >>> table = dr.read_csv("drop.csv")
-        >>> {"t": table["time"], "ball.x[1]": 1e-3 * table["height_mm"]}["ball.x[1]"].tolist()
-        [1.25, 1.1935]
-    """
-    try:
-        with open(Path(path), newline="", encoding="utf-8-sig") as file:  # a number would be an open file
-            lines = {n: line for n, line in enumerate(file, 1) if line.strip() and not line.startswith("#")}
-        numbers, texts = list(lines), list(lines.values())
-        mark = next((mark for mark in ";\t" if texts and mark in texts[0]), ",")
-        reader = csv.reader(texts, delimiter=mark)
-        rows = [(numbers[reader.line_num - 1], row) for row in reader]
-    except UnicodeEncodeError:
-        raise ValueError(f"{str(path)!r} cannot be the name of a file") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a CSV file: {error}") from None
-    if not rows:
-        raise ValueError(f"{path} is empty: expected a line of names, and numbers under it")
-    names, body = [name.strip() for name in rows[0][1]], [row for _, row in rows[1:]]
-    for name, use in (only or {}).items():
-        if name not in names:
-            raise ValueError(f"{path} has no column {name!r}, which is {use!r} here: {nearest(name, names)}")
-    kept = [k for k, name in enumerate(names) if name not in left_out and (only is None or name in only)]
-    if twice := [names[k] for k in kept if names[k] in names[:k]]:
-        raise ValueError(f"{path}: two columns have the name {twice[0]!r}: rename one, or leave it out")
-    for number, row in rows[1:]:
-        if len(row) != len(names):
-            raise ValueError(f"{path}, line {number}: {len(row)} cells, expected {len(names)}, one for each name")
-        for k in kept:
-            cell = row[k].replace(",", ".") if mark != "," else row[k]
-            if cell.strip() and not _is_number(cell):
-                raise ValueError(
-                    f"{path}, line {number}, column {names[k]!r} is {row[k]!r}: expected numbers under one line of "
-                    "names, empty where missing"
-                )
-    if mark != ",":
-        body = [[cell.replace(",", ".") for cell in row] for row in body]
-    cells = np.array([[float(row[k]) if row[k].strip() else np.nan for k in kept] for row in body])
-    return {names[k]: cells[:, j] if len(body) else np.zeros(0) for j, k in enumerate(kept)}
 
 
 def _table(observations: Any, where: str, left_out: Collection[str]) -> dict[str, Any]:
@@ -180,17 +125,9 @@ def _odd_one(values: Any) -> str:
     """Say which of several values is no number; "" if that is not to be seen."""
     rows = isinstance(values, list | tuple) or isinstance(values, np.ndarray) and values.ndim > 0
     for row, value in enumerate(values if rows else ()):
-        if isinstance(value, str) and not _is_number(value):
+        if isinstance(value, str) and not is_number(value):
             return f", with {value!r} in row {row}"
     return ""
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return "_" not in cell  # which Python takes
 
 
 def check_mapping(where: str, value: Any) -> None:
@@ -218,6 +155,26 @@ def _gather(table: Mapping[str, Any]) -> dict[str, Any]:
         else:
             out[name] = values
     return out
+
+
+def _at_all_times(
+    parts: dict[int, Any], shared: np.ndarray | None, where: str
+) -> tuple[np.ndarray | None, dict[int, Any]]:
+    """Times of a column whose components may have their own, (t, values), and its components then, NaN between."""
+    pairs = {index: part for index, part in parts.items() if isinstance(part, tuple) and len(part) == 2}
+    if not pairs or (shared is None and len(pairs) < len(parts)):
+        return shared, parts
+    times = {index: as_times(part[0], f"{where}[{index}]") for index, part in pairs.items()}
+    if shared is not None:
+        times |= {index: shared for index in parts if index not in pairs}
+    t, whole = np.unique(np.concatenate(list(times.values()))), {}
+    for index, part in parts.items():
+        measured = as_floats(part[1] if index in pairs else part, f"{where}[{index}]")
+        if measured.shape != (rows := times[index].shape):
+            raise ValueError(f"{where}[{index}] has shape {measured.shape}, expected {rows} like its times")
+        whole[index] = np.full(len(t), np.nan)
+        whole[index][np.searchsorted(t, times[index])] = measured
+    return t, whole
 
 
 def _filled(values: Any, rows: int, size: int, name: str, where: str, world: World) -> np.ndarray:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from diffrigid import scene_file
-from diffrigid.sysid.columns import read_csv
+from diffrigid.sysid.csv_file import read_csv
 from diffrigid.sysid.fit import fit
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.summary import load_fit

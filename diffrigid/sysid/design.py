@@ -193,14 +193,17 @@ def _problem(scenes: Sequence[tuple[World, State]], planned, free, noise, observ
     columns = {name: values for name, values in planned.items() if name == "t" or name in acting}
     kept, wholes = set(), {name: _whole(name, observe) for name in planned if name not in columns}
     for name, whole in wholes.items():
-        if whole not in (noise or {}):
+        if not {name, whole} & (noise or {}).keys():
             raise ValueError(f"noise: expected a standard deviation for every planned column, {whole!r} has none")
         values = _zeros(world, name, planned[name], len(t), observe)
         if np.isfinite(values).any():  # otherwise nothing will be measured
             columns[name] = values
             kept.add(whole)
     gone = set(wholes.values()) - kept
-    noise, observe = ({name: v for name, v in given.items() if name not in gone} for given in (noise or {}, observe))
+    noise, observe = (
+        {name: v for name, v in given.items() if not {name, component(name)[0]} & gone}
+        for given in (noise or {}, observe)
+    )
     records = [Record(columns, state=s, world=w) for w, s in scenes]
     return make_problem(world, state, records, free=free, noise=noise, observe=observe, dt=dt)
 

@@ -59,18 +59,18 @@ def fit(
 
     Args:
         observations: "t" [s] and columns "body.x", "body.v", "body.angle", "body.q", "body.w", arrays of K rows, or a
-            table or CSV file with columns "t", "body.x[0]", ...; NaN is missing. A column with times of its own is a
-            pair (t, values). The first time is that of `state`. A column with the name of a `control` of a force is
-            that control, each value held until the next. A list of such observations, or of `Record`, is fitted
-            together.
+            table or CSV file with columns "t", "body.x[0]", ...; NaN is missing. A column, or a component, with times
+            of its own is a pair (t, values). The first time is that of `state`. A column with the name of a `control`
+            of a force is that control, each value held until the next. A list of such observations, or of `Record`, is
+            fitted together.
         free: what may vary: a path (see `diffrigid.paths` and `diffrigid.sysid.sensors`), or a tuple of paths that
             share one value. `each(kind)` gives every record its own, which begins as its first rows show it;
             `through(write, kind, start)` is a number that sets several.
         starts: the first is at the values of `world` and `state`, the others are random.
         dt: [s] longest step; default 1.1 times the median of the intervals of t, but no more than 0.02 s where bodies
             touch, have joints, or forces vary.
-        noise: standard deviation of each column, in its unit, a number or an array like the column; noise that is not
-            given is estimated from the residuals.
+        noise: standard deviation of each column or component, in its unit, a number or an array like it; noise that is
+            not given is estimated from the residuals.
         observe: what a column observes if its name does not say so: {"tip": Marker("rod", point=(0.3, 0))};
             None leaves it out.
         widths: [m] of the smooth impacts, one fit after the other, each from the last: (0.5, 0.1, 0.0) lets starts that

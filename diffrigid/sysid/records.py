@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from diffrigid.catalogue import component
 from diffrigid.controls import controlled
-from diffrigid.convert import known_number, positive
+from diffrigid.convert import known_number, numbers, positive
 from diffrigid.spelling import in_words
 from diffrigid.state import State
 from diffrigid.sysid.columns import Series, check_mapping, columns, odd_places, odd_speeds
@@ -91,7 +92,7 @@ def runs(world: World, state: State, observations: Any, observe: Mapping[str, An
     if any(odd):
         warnings.warn(next(part + text for part, text in zip(where, odd, strict=True) if text), stacklevel=4)
     everywhere = sorted({s.name for run in found for s in run.series})
-    if unknown := set(noise or {}) - set(everywhere):
+    if unknown := {name for name in noise or {} if not {name, component(name)[0]} & set(everywhere)}:
         raise ValueError(f"noise: no column {sorted(unknown)[0]!r} in observations, there are {everywhere}")
     _refuse_empty_columns(found)
     return found
@@ -107,7 +108,7 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
         positive(f"{name}.mass", mass, "begin with another")
     series, channels, controls = columns(world, record.observations, observe, where)
     names = [s.name for s in series]
-    own = dict(record.noise or {})
+    own = _of_columns(record.noise or {}, series, f"{where}.noise")
     if unknown := set(own) - set(names):
         raise ValueError(f"{where}.noise: no column {sorted(unknown)[0]!r}, there are {names}")
     first = min(float(s.t[0]) for s in series)
@@ -127,8 +128,32 @@ def _run(world: World, state: State, record: Record, observe: Mapping, noise: Ma
                 f"{where}[{control.name!r}] begins at {moment(control.t[0])} s, after the start {moment(start)} s: "
                 "what acts before?"
             )
-    given = {name: sigma for name, sigma in noise.items() if name in names} | own
+    given = {name: sigma for name, sigma in _of_columns(noise, series, "noise").items() if name in names} | own
     return Run(world, state, channels, series, start, given, controls, record.state is not None)
+
+
+def _of_columns(noise: Mapping[str, Any], series: tuple[Series, ...], where: str) -> dict[str, Any]:
+    """Noise by column, where some was given by component: "ball.x[1]"."""
+    by_name, whole = {s.name: s for s in series}, dict(noise)
+    for name in noise:
+        column, index = component(name)
+        if index is None or name in by_name or column not in by_name:
+            continue
+        if column in noise:
+            raise ValueError(f"{where}: both {column!r} and {name!r} are given: leave one out")
+        values = by_name[column].values
+        if index >= values.shape[1]:
+            raise ValueError(f"{where}[{name!r}]: {column} has {values.shape[1]} numbers, from [0] on")
+        del whole[name]
+        sigma = whole.setdefault(column, np.where(np.isnan(values).all(0), 1.0, np.nan) * np.ones(values.shape))
+        given = np.asarray(numbers(f"{where}[{name!r}]", noise[name], None))
+        if given.shape not in ((), values.shape[:1]):
+            raise ValueError(f"{where}[{name!r}] has shape {given.shape}, expected a number or {values.shape[:1]}")
+        sigma[:, index] = given
+    for column in whole.keys() - noise.keys():
+        if lacks := np.flatnonzero(np.isnan(whole[column]).any(0)).tolist():
+            raise ValueError(f"{where}: {column}[{lacks[0]}] has none: give it too, or one number for {column!r}")
+    return whole
 
 
 def same_data(one: Run, other: Run) -> bool:
