@@ -53,10 +53,8 @@ def columns(
             t, values = _at_all_times(values, shared, f"{where}[{name!r}]")
         elif isinstance(values, tuple) and len(values) == 2:
             t, values = as_times(values[0], f"{where}[{name!r}]"), values[1]
-        elif shared is not None:
-            t = shared
         else:
-            t = None
+            t = shared
         if t is None:
             raise ValueError(f'{where}: expected a column "t" of times [s], got {sorted(gathered)}')
         if name in sizes:
