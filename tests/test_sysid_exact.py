@@ -450,7 +450,7 @@ def test_a_later_part_of_a_record_is_scored_from_the_start_of_the_motion():
 
 
 def test_records_that_were_fitted_are_scored_from_what_was_found(fit, records, monkeypatch):
-    monkeypatch.setattr(sys.modules["diffrigid.sysid.result"], "SCORE_ITERATIONS", 0)
+    monkeypatch.setattr(sys.modules["diffrigid.sysid.score"], "SCORE_ITERATIONS", 0)
     backwards = records[::-1]
     residuals = np.concatenate([columns["p.x"].ravel() for columns in fit.residuals])
     expected = fit.noise["p.x"] * np.sqrt(np.nanmean(residuals**2))

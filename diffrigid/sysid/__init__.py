@@ -7,7 +7,7 @@ To read it, in the order of a fit; `fit.py` runs it:
     the problem           setup.py, first_rows.py, problem.py (from z to residuals), clocks.py, points.py (back)
     solvers               levenberg.py, gradient.py, vector.py (for any other); segments.py for long records
     how sure              noise.py, covariance.py, profile.py, sampling.py, diagnosis.py, remarks.py, orders.py
-    what comes out        result.py, intervals.py, summary.py, table.py
+    what comes out        result.py, score.py, intervals.py, summary.py, table.py
     before measuring      design.py
     from the shell        command.py
 
