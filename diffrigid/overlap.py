@@ -18,6 +18,7 @@ from diffrigid.state import State, rotations
 from diffrigid.world import World, seated, seats
 
 DEEP = 1e-4  # [-] of the smaller size: penetration at the start that is worth a warning
+SHOWN = 8  # pairs that a warning lists
 
 
 class Outline(NamedTuple):
@@ -92,8 +93,13 @@ def warn_of_overlap(world: World, state: State) -> None:
     placed = outlines(world, state)
     if deep := overlapping(placed, near_pairs(placed, len(world.names)) if world.crowd else pairs_of(world)):
         names = world.names + world.static_names
-        both = sorted({(min(i[0], j[0]), max(i[0], j[0])) for i, j in deep})
-        text = ", ".join(f"{names[i]} and {names[j]}" for i, j in both)
+        depths: dict[tuple[int, int], float] = {}
+        for (i, j), depth in deep.items():
+            both = min(i[0], j[0]), max(i[0], j[0])
+            depths[both] = max(depth, depths.get(both, 0.0))
+        listed = sorted(depths.items())
+        text = ", ".join(f"{names[i]} and {names[j]} by {depth:.2g} m" for (i, j), depth in listed[:SHOWN])
+        text += f", and {len(listed) - SHOWN} more pairs" if len(listed) > SHOWN else ""
         warnings.warn(f"bodies overlap at the start: {text}; move them apart or list them in ignore", stacklevel=3)
 
 
@@ -121,15 +127,16 @@ def pairs_of(world: World) -> list[tuple[tuple[int, int, int], tuple[int, int, i
     return found
 
 
-def overlapping(colliders: dict[tuple, Outline], pairs: list) -> list[tuple[tuple, tuple]]:
-    """Pairs (i, j) of keys of `colliders` that penetrate deeply."""
+def overlapping(colliders: dict[tuple, Outline], pairs: list) -> dict[tuple[tuple, tuple], float]:
+    """Pairs (i, j) of keys of `colliders` that penetrate deeply, and how deep [m]."""
     size = {key: collider.size for key, collider in colliders.items()}
     centre = {key: collider.corners.mean(0) for key, collider in colliders.items()}
-    deep = []
+    deep = {}
     for i, j in pairs:
         if i in size and j in size and np.linalg.norm(centre[i] - centre[j]) < size[i] + size[j]:
-            if separation(colliders[i], colliders[j]) < -DEEP * min(size[i], size[j]):
-                deep.append((i, j))
+            depth = -separation(colliders[i], colliders[j])
+            if depth > DEEP * min(size[i], size[j]):
+                deep[i, j] = float(depth)
     return deep
 
 

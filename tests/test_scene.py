@@ -202,7 +202,7 @@ def test_overlap_warns_with_names(depth):
         dr.scene(bodies, ignore=[("ball", "floor")])
     messages = [str(warning.message) for warning in caught]
     assert len(messages) == (depth > 0)
-    assert all("ball and floor" in m and "other" not in m and "ignore" in m for m in messages)
+    assert all("ball and floor by 0.05 m;" in m and "other" not in m and "ignore" in m for m in messages)
 
 
 # ---- what comes out
