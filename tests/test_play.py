@@ -265,11 +265,11 @@ def test_two_walls_struck_within_a_step_have_their_own_impulses():
 
 def test_impacts_that_follow_each_other_within_a_step_are_all_found():
     """A cradle: only the first two come together on the free flight from the start of the step."""
-    row = {name: dr.Body(DISC, mass=1.0, x=(0.202 * k - 0.048 * (k == 0), 0.0)) for k, name in enumerate("abcd")}
+    row = {name: dr.Body(DISC, mass=1.0, x=(0.202 * k - 0.048 * (k == 0), 0.0)) for k, name in enumerate("abc")}
     row["a"] = dr.replace(row["a"], v=(3.0, 0.0))
     found = total_impulses(row, steps=3, restitution=0.8)
     u, t = 3.0, 0.05 / 3.0
-    for pair in ("a-b", "b-c", "c-d"):
+    for pair in ("a-b", "b-c"):
         np.testing.assert_allclose(found[pair][1], [-0.5 * 1.8 * u, 0.0], atol=1e-6)
         assert abs(found[pair][0][0] - t) < 1e-4
         u *= 0.9
@@ -279,14 +279,10 @@ def test_impacts_that_follow_each_other_within_a_step_are_all_found():
 def test_what_slides_into_something_pushes_it_and_not_the_floor():
     """The floor can only change momenta by its friction, and without any by nothing."""
     for mu in (0.0, 0.2):
-        bodies = {
-            "a": dr.Body(SQUARE, mass=1.0, x=(0.0, 0.1), v=(2.0, 0.0)),
-            "b": dr.Body(SQUARE, mass=2.0, x=(0.25, 0.1)),
-            "floor": FLOOR,
-        }
-        ((_, P),) = total_impulses(bodies, gravity=(0.0, -G), restitution=0.5, friction=mu).values()
+        bodies = {"a": dr.Body(SQUARE, mass=1.0, x=(0.85, 0.1), v=(2.0, 0.0)), "floor": FLOOR, "wall": WALL}
+        ((_, P),) = total_impulses(bodies, steps=3, gravity=(0.0, -G), restitution=0.5, friction=mu).values()
         u = np.sqrt(4.0 - 2 * mu * G * 0.05)
-        np.testing.assert_allclose(P, [-2 / 3 * 1.5 * u, 0.0], atol=mu * 3 * G / 60 + 1e-9)
+        np.testing.assert_allclose(P, [-1.5 * u, 0.0], atol=mu * G / 60 + 1e-9)
 
 
 def test_a_corner_that_lands_beside_one_that_touches_is_found():
