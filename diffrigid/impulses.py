@@ -55,7 +55,8 @@ class Changes(NamedTuple):
 
     p: np.ndarray  # (T, N, D) [N s] beyond what the forces do
     L: np.ndarray  # (T, N, A) [N m s] likewise
-    fall: np.ndarray  # (T, N, D) [m/s^2] by the forces
+    load: np.ndarray  # (T, N, D + A) [N s], [N m s] by the forces
+    fall: np.ndarray  # (T, N, D) [m/s^2] likewise
     push: np.ndarray  # (T, N) [N s] size of the impulse of the forces, on it or on what joints connect it with
     joints: Joints
 
@@ -77,7 +78,7 @@ def changes_of(trajectory: Trajectory) -> Changes:
         push[:, bodies] = push[:, bodies].max(1, keepdims=True)
     joints = Joints(np.array(ends, int).reshape(-1, 2).T, made)
     fall = forces[..., :dim] / (np.asarray(world.bodies.mass, float)[:, None] * h[:, None, None])
-    return Changes(change[..., :dim], change[..., dim:], fall, push, joints)
+    return Changes(change[..., :dim], change[..., dim:], forces, fall, push, joints)
 
 
 class Touching(NamedTuple):
@@ -118,32 +119,39 @@ def impulses_at(changes: Changes, touching: Touching) -> tuple[np.ndarray, np.nd
                 _by_points(here(ends[:, chosen]), arms[:, chosen], len(bodies), changes.L.shape[2]),
                 _by_joints(here(joints.ends[:, own]), joints.made[k, own], len(bodies)),
             ], axis=1)  # fmt: skip
-            found[chosen], rest = _in_cones(A, change[k, bodies].ravel(), *(leaf[chosen] for leaf in touching[3:]))
+            both = change[k, bodies].ravel(), changes.load[k, bodies].ravel()
+            found[chosen], rest = _in_cones(A, *both, *(leaf[chosen] for leaf in touching[3:]))
             left[k, bodies] = rest.reshape(len(bodies), -1)[:, : arms.shape[2]]
     return found, left
 
 
 def _in_cones(
-    A: np.ndarray, change: np.ndarray, normal: np.ndarray, mu: np.ndarray, new: np.ndarray
+    A: np.ndarray, change: np.ndarray, load: np.ndarray, normal: np.ndarray, mu: np.ndarray, new: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Impulses (C, D) of the first C D columns of A that push and rub within their cones, and what remains of `change`.
 
-    From the least without cones on, contacts that pull are left out, and those that rub too much slide that way; unless
+    Where something new strikes, contacts that rested carry the load of the forces as if nothing had. From the least
+    beyond that without cones on, contacts that pull are left out, and those that rub too much slide that way; unless
     this explains less.
     """
     count, D = normal.shape
     known = normal.any(1)
     ways = [np.eye(D) * (1.0 if first else RESTED) for first in new]
-    others = A[:, count * D :]
+    columns, others = np.split(A[:, : count * D], count, axis=1), A[:, count * D :]
+    support = np.zeros((count, D))
+    if new.any() and not new.all():
+        at_rest = np.flatnonzero(~new)
+        B = np.concatenate([*(columns[c] for c in at_rest), others], axis=1)
+        y = _least(B, -load)
+        if np.linalg.norm(B @ y + load) <= LEFT * np.linalg.norm(load):
+            support[at_rest] = y[: len(at_rest) * D].reshape(-1, D)
 
     def least() -> tuple[np.ndarray, np.ndarray]:
-        columns = [A[:, c * D : c * D + D] @ way for c, way in enumerate(ways)]
-        B = np.concatenate([*columns, others], axis=1)
-        square, size = B @ B.T, (B**2).sum()
-        lam = np.linalg.solve(square + SOFT * size * np.eye(len(square)), change) if size else 0.0 * change
-        y, ends = B.T @ lam, np.cumsum([way.shape[1] for way in ways])
+        B = np.concatenate([*(column @ way for column, way in zip(columns, ways, strict=True)), others], axis=1)
+        beyond = change - A[:, : count * D] @ support.ravel()
+        y, ends = _least(B, beyond), np.cumsum([way.shape[1] for way in ways])
         P = np.stack([way @ part for way, part in zip(ways, np.split(y[: ends[-1]], ends[:-1]), strict=True)])
-        return P, change - B @ y
+        return support + P, beyond - B @ y
 
     P, left = first = least()
     most = np.linalg.norm(left) + LEFT * np.linalg.norm(change)
@@ -155,6 +163,7 @@ def _in_cones(
         slides = known & ~pulls & (rub > mu * push + out) & [way.shape[1] == D for way in ways]
         if not (pulls | slides).any():
             break
+        support[pulls | slides] = 0.0
         for c in np.flatnonzero(pulls):
             ways[c] = np.zeros((D, 0))
         for c in np.flatnonzero(slides):
@@ -163,6 +172,12 @@ def _in_cones(
         if np.linalg.norm(left) > most:
             return first
     return P, left
+
+
+def _least(B: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """The smallest y with B y = change, or nearest to it."""
+    square, size = B @ B.T, (B**2).sum()
+    return B.T @ np.linalg.solve(square + SOFT * size * np.eye(len(square)), change) if size else np.zeros(B.shape[1])
 
 
 def _by_points(ends: np.ndarray, arms: np.ndarray, moving: int, A: int) -> np.ndarray:
