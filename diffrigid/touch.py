@@ -24,6 +24,8 @@ BEYOND = 1.1  # [-] times the sizes,
 FASTER = 1.5  # [-] and times the path at the first speed: what is further apart does not meet
 NO_SIZE = 1e-9  # [m, N s] where there is no size, no force
 BENT = 0.1  # [-] of the path by the forces: a path that deviates more from that of an even force has an impact,
+SOON = 1e-3  # [-] of an interval, in which the closing speed at its start is found
+SPIKE = 1.5  # [-] of the accelerations in the intervals beside it: so does a larger one of a body with joints
 SUPPORTED = 1.2  # [-] of the impulse of the forces: a support balances them, an impact changes the momentum by more
 ASIDE = 1e-6  # [-] of the smaller size: by so much a body is moved to find a normal, which is the rise of the gap,
 UNIQUE = 0.01  # [-] and has the length 1 to this, or is none
@@ -49,7 +51,7 @@ class Sampled(NamedTuple):
     q: np.ndarray  # (T+1, N + S, Q)
     v: np.ndarray  # (T+1, N + S, D)
     w: np.ndarray  # (T+1, N + S, A)
-    a: np.ndarray  # (T, N + S, D) [m/s^2] before an impact in the interval; even, with a joint or without an impact
+    a: np.ndarray  # (T, N + S, D) [m/s^2] before an impact in the interval; even, without one or with joints
 
 
 def touches(world: World, motion: Sampled, changes: Changes) -> Touch:
@@ -77,10 +79,23 @@ def sampled(trajectory: Trajectory, changes: Changes) -> Sampled:
     even = np.diff(v, axis=0) / h[..., None]
     off = np.linalg.norm(np.diff(state.x, axis=0) - 0.5 * h[..., None] * (v[1:] + v[:-1]), axis=2)
     hit = (np.linalg.norm(changes.p, axis=2) > SUPPORTED * changes.push) | (off > BENT * h * changes.push / mass)
-    hit &= ~np.isin(np.arange(len(mass)), changes.joints.ends)
     a = np.where(hit[..., None], changes.fall, even)
+    held = np.isin(np.arange(len(mass)), changes.joints.ends)
+    a[:, held] = _between_impacts(even[:, held], off[:, held], h)
     a = np.concatenate([a, np.zeros((steps - 1, count, x.shape[2]))], axis=1)
     return Sampled(np.asarray(trajectory.t), x, q, joined(state.v, 0.0), joined(state.w, 0.0), a)
+
+
+def _between_impacts(even: np.ndarray, off: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Accelerations (T, n, D) of bodies whose joints bend their paths, from the even ones of their intervals.
+
+    In one with an impact, which is larger than those beside it or leaves its parabola, that of the one before.
+    """
+    size = np.linalg.norm(even, axis=2)
+    around = np.pad(size, [(1, 1), (0, 0)], constant_values=np.inf)
+    hit = (size > SPIKE * np.minimum(around[:-2], around[2:])) | (off > BENT * h**2 * size)
+    before = np.concatenate([np.zeros_like(even[:1]), np.where(hit[..., None], 0.0, even)[:-1]])
+    return np.where(hit[..., None], before, even)
 
 
 def _of_kind(world: World, group: Any, motion: Sampled, changes: Changes) -> Touch:
@@ -90,11 +105,10 @@ def _of_kind(world: World, group: Any, motion: Sampled, changes: Changes) -> Tou
     h, size = np.diff(motion.t), np.minimum(sides[0].size[rows[0]], sides[1].size[rows[1]])
     change = np.linalg.norm(changes.p, axis=2) + np.linalg.norm(changes.L, axis=2) / max(size.min(), NO_SIZE)
     struck = change > STRUCK * (changes.push + NO_SIZE)
-    struck = np.concatenate([struck, np.zeros((len(struck), len(world.static_names)), bool)], axis=1)
     apart = np.linalg.norm(motion.x[:-1, a] - motion.x[:-1, b], axis=2)
     path = h[:, None] * np.linalg.norm(motion.v[:-1, a] - motion.v[:-1, b], axis=2)
     reach = BEYOND * (sides[0].size[rows[0]] + sides[1].size[rows[1]]) + FASTER * path
-    k, pair = np.nonzero((struck[:, a] | struck[:, b]) & (apart < reach))
+    k, pair = np.nonzero(struck.any(1, keepdims=True) & (apart < reach))  # what passes an impact on may not change
     slop, row_a, row_b = SLOP * size[pair], rows[0][pair], rows[1][pair]
 
     def two(s, chosen=slice(None)):
@@ -109,7 +123,10 @@ def _of_kind(world: World, group: Any, motion: Sampled, changes: Changes) -> Tou
     (start, point), (end, _) = at(np.zeros(len(k))), at(h[k])
     poses = [(motion.x[k + 1, body[pair]], motion.q[k + 1, body[pair]]) for body in (a, b)]
     stored, _ = gaps(sides[0].take(row_a), poses[0], sides[1].take(row_b), poses[1])
-    apart, close = start > slop[:, None], end <= slop[:, None]
+    with np.errstate(invalid="ignore"):  # of a corner that is over no face
+        closing = (start - at(SOON * h[k])[0]) / (SOON * h[k])[:, None]
+    apart = (start > slop[:, None]) | (closing * h[k, None] > slop[:, None])
+    close = end <= slop[:, None]
     comes, rests = apart & close, ~apart & (close | (stored <= slop[:, None]))
     s = _meeting(at, h[k], comes)
     gap, there = at(s)

@@ -276,6 +276,38 @@ def test_impacts_that_follow_each_other_within_a_step_are_all_found():
         t += 0.002 / u
 
 
+def test_discs_that_touch_pass_an_impact_on():
+    """The momentum of those in the middle does not change."""
+    row = {name: dr.Body(DISC, mass=1.0, x=(0.2 * k - 0.05 * (k == 0), 0.0)) for k, name in enumerate("abcd")}
+    row["a"] = dr.replace(row["a"], v=(3.0, 0.0))
+    found = total_impulses(row, steps=3, restitution=1.0)
+    for pair in ("a-b", "b-c", "c-d"):
+        np.testing.assert_allclose(found[pair][1], [-3.0, 0.0], atol=1e-6)
+        np.testing.assert_allclose(found[pair][0], 0.05 / 3, atol=1e-5)
+
+
+@pytest.mark.parametrize("phase", [0.1, 0.5, 0.9])
+def test_impacts_of_bodies_with_joints_are_found_wherever_in_an_interval_they_are(phase):
+    """Two welded discs, and a hinged rod whose path the hinge bends, I = m l^2 / 3 about it."""
+    wall = dr.Static(dr.HalfSpace(normal=(-1.0, 0.0), offset=-0.2 - (3 + phase) * 2 / 60))
+    discs = {name: dr.Body(DISC, mass=1.0, x=(0.1, 0.2 * k), v=(2.0, 0.0)) for k, name in enumerate("ab")}
+    found = total_impulses({**discs, "wall": wall}, steps=6, restitution=0.5, joints=[dr.Weld("a", "b")])
+    for pair in ("a-wall", "b-wall"):
+        np.testing.assert_allclose(found[pair][1], [-3.0, 0.0], atol=1e-6)
+        np.testing.assert_allclose(found[pair][0], (3 + phase) / 60, atol=1e-5)
+    turned = 2.0 * (6 + phase) / 60
+    wall = dr.Static(dr.HalfSpace(normal=(-1.0, 0.0), offset=-np.sin(turned)))
+    rod = dr.Body(
+        dr.Box(half=(0.5, 0.0)), mass=1.0, inertia=1 / 12, x=(0.0, -0.5), angle=-np.pi / 2, v=(1.0, 0.0), w=2.0
+    )
+    found = total_impulses(
+        {"rod": rod, "wall": wall}, steps=9, restitution=0.5, joints=[dr.Revolute("rod", anchor_a=(-0.5, 0.0))]
+    )
+    ((t, P),) = found.values()
+    np.testing.assert_allclose(P, [-1.5 * 2.0 / 3 / np.cos(turned), 0.0], atol=5e-3)
+    np.testing.assert_allclose(t, (6 + phase) / 60, atol=2e-3 / 60)
+
+
 def test_what_slides_into_something_pushes_it_and_not_the_floor():
     """The floor can only change momenta by its friction, and without any by nothing."""
     for mu in (0.0, 0.2):

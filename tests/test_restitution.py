@@ -69,3 +69,16 @@ def test_a_fit_finds_both_numbers():
         parameter = fit[name]
         assert abs(parameter.value - truth) < parameter.high - parameter.low < 0.1 * truth, name
     assert "s/m" in repr(fit)
+
+
+@pytest.mark.parametrize("early", [-1e-14, 0.0, 1e-14])
+def test_an_impact_at_the_end_of_a_step_rebounds_beside_a_floor(early):
+    """Discs that rest on it, which their weight does not press together: v (1 - e) / 2 and v (1 + e) / 2."""
+    disc = dr.Disc(radius=0.1)
+    bodies = {
+        "a": dr.Body(disc, mass=1.0, x=(0.0, 0.1), v=(0.2, 0.0)),
+        "b": dr.Body(disc, mass=1.0, x=(0.21 * (1 + early), 0.1)),
+        "floor": dr.Static(dr.HalfSpace(normal=(0.0, 1.0))),
+    }
+    run = dr.rollout(*dr.scene(bodies, gravity=(0.0, -9.81), restitution=0.5), dt=1 / 60, steps=6)
+    assert_allclose(run.state.v[-1], [[0.05, 0.0], [0.15, 0.0]], atol=1e-9)

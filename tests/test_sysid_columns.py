@@ -21,6 +21,7 @@ from diffrigid.sysid.channels import channel_of
 from diffrigid.sysid.columns import columns
 from diffrigid.sysid.csv_file import read_csv
 from diffrigid.sysid.parameters import channel_paths
+from diffrigid.sysid.remarks import _averaged
 from diffrigid.sysid.sensors import difference, predict
 from diffrigid.sysid.setup import make_problem
 
@@ -465,3 +466,25 @@ def test_a_clock_that_jitters_takes_one_step_for_each_frame():
     assert problem.groups[0].data.lengths.shape[0] == 59
     single = (np.arange(36, dtype=np.float32) / np.float32(30)).astype(float)
     assert (steps_in(np.diff(single), 1 / 30) == 1).all() and steps_in(np.array([35 / 30]), np.float32(1 / 30)) == 35
+
+
+def test_what_is_measured_to_be_constant_and_fitted_exactly_is_doubted():
+    """As zeros midway between the clicks of a ball, which one that lies on the floor fits too."""
+    still = {"t": T, "ball.x": np.tile([4.0, 6.0], (6, 1))}
+    found = dr.fit(WORLD, STATE, still, free={"ball.v": dr.real()}, progress=False)
+    assert found.doubts == ("what was measured is constant",)
+    moving = {"t": T, "ball.x": still["ball.x"] + T[:, None]}
+    assert dr.fit(WORLD, STATE, moving, free={"ball.v": dr.real()}, progress=False).doubts == ()
+
+
+def test_a_coefficient_that_counts_half_is_noted():
+    """Of a body that was given none of its own the scene's is half in each pair; a value of its own outweighs it."""
+    floor = dr.HalfSpace(normal=(0.0, 1.0))
+    ball = dr.Body(dr.Disc(radius=0.1), mass=1.0, x=(0.0, 1.0))
+    for own, notes in ((None, 1), (0.3, 0)):
+        scene = dr.scene({"ball": ball, "floor": dr.Static(floor, friction=own)}, friction=0.3)
+        for free in ("floor.friction", "friction"):
+            problem = make_problem(*scene, {"t": T, "ball.x": np.zeros((6, 2))}, free={free: dr.positive()})
+            found = _averaged(problem)
+            assert len(found) == notes * (free != "friction")
+            assert all(note.startswith("floor.friction counts half") for note in found)

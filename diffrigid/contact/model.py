@@ -295,7 +295,11 @@ def _held(
 
 
 def _fallen(world: "World", flight: Flight, strikes: Strikes, closing_acc: Array, dt: Array) -> Array:
-    """Largest closing speed (C, *batch) [m/s] that a resting contact reaches in a step of free fall of both bodies."""
-    fall = dt[None] * jnp.sqrt((flight.a**2).sum(1))
-    of_both = jnp.maximum(at_colliders(fall, strikes.a, 0.0), at_colliders(fall, strikes.b, 0.0))
-    return world.contact.rest_speed[None] + 2.0 * jnp.maximum(of_both, closing_acc * dt[None])
+    """Largest closing speed (C, *batch) [m/s] that a resting contact reaches in a step of free fall of both bodies.
+
+    Along its normal: what two bodies on a floor do beside each other has nothing to do with their weight.
+    """
+    along = [
+        jnp.abs(jax.vmap(dot)(strikes.normal, at_colliders(flight.a, side, 0.0))) for side in (strikes.a, strikes.b)
+    ]
+    return world.contact.rest_speed[None] + 2.0 * dt[None] * jnp.maximum(jnp.maximum(*along), closing_acc)

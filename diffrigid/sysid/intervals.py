@@ -13,6 +13,7 @@ from diffrigid.catalogue import component, unit
 from diffrigid.compiling import QUICK, compiled, uncollected
 from diffrigid.paths import write
 from diffrigid.state import State
+from diffrigid.sysid.columns import Series
 from diffrigid.sysid.covariance import LEAST_FREE, TINY, Linear, Uncertainty, joint_covariance, own_covariance
 from diffrigid.sysid.diagnosis import (
     Blind,
@@ -31,7 +32,7 @@ from diffrigid.sysid.noise import exact_columns
 from diffrigid.sysid.parameters import Slot, pieces, put, reference
 from diffrigid.sysid.setup import Problem, first_value, noise_guesses, scene_having, scene_of
 from diffrigid.sysid.summary import Parameter
-from diffrigid.sysid.table import BLIND, BOUND, ENDED, FAILED, STICKS
+from diffrigid.sysid.table import BLIND, BOUND, ENDED, FAILED, FLAT, STICKS
 from diffrigid.world import World
 
 UNSEEN = 1e-6  # [-] part of a slope along undetermined directions: more is not rounding
@@ -132,11 +133,19 @@ def _notes(
     return notes + _together(uncertainty.covariance, places, blind)
 
 
+def _is_flat(series: Sequence[Series], names: list[str]) -> bool:
+    """Whether no column of these names changes."""
+    values = [s.values[:, np.isfinite(s.values).any(0)] for s in series if s.name in names]
+    return all((np.nanmax(v, axis=0) == np.nanmin(v, axis=0)).all() for v in values)
+
+
 def _doubts(problem: Problem, linear: Linear, residuals: tuple[dict[str, np.ndarray], ...], loss: Loss) -> list[str]:
     """Why not to believe the intervals, as residuals show."""
     notes = []
     if exact := exact_columns(problem):
         names = ", ".join(exact)
+        if all(_is_flat(run.series, exact) for run in problem.runs):
+            notes.append(f"{FLAT}, and fitted exactly ({names}): by a body at rest, too; look whether it moves")
         notes.append(f"residuals of {names} are rounding, as for simulated data without noise: intervals mean nothing")
     tested = [column for record in residuals for name, column in record.items() if name not in exact]
     series = [r for column in tested for r in column.T if np.nanmax(np.abs(r), initial=0.0) > FAINT]

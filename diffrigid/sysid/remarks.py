@@ -53,7 +53,7 @@ def remarks_on(
     """
     failure = failed(problem, residuals, strikes)
     out = [failure] if failure else []
-    out += _torn(scenes[0]) + _light_inertia(problem, scenes[0])
+    out += _torn(scenes[0]) + _light_inertia(problem, scenes[0]) + _averaged(problem)
     if np.isfinite(problem.window):
         out.append(f"only the first {problem.window:g} s of each record are fitted")
     return out
@@ -215,6 +215,21 @@ def _light_inertia(problem: Problem, scene: Scene) -> list[str]:
             out.append(
                 f"{name}.mass is {factor:.2g} times what it was, {name}.inertia is as it was: where {name} is solid, "
                 f"free {name}.density instead, which sets both"
+            )
+    return out
+
+
+def _averaged(problem: Problem) -> list[str]:
+    """Remarks on coefficients of one body that count half, as the scene's own are the other half."""
+    world, out = problem.runs[0].world, []
+    names = world.names + world.static_names
+    for path in (path for slot in problem.slots for path in slot.paths):
+        owner, _, coefficient = path.rpartition(".")
+        own = dict(world.own).get(coefficient)
+        if own is not None and owner in names and not own[names.index(owner)]:
+            out.append(
+                f"{path} counts half: in each pair it is averaged with the {coefficient} of the other, as {owner} was "
+                f'given none of its own; give it one, {coefficient}=..., or free "{coefficient}"'
             )
     return out
 

@@ -18,8 +18,9 @@ ENDED = " ended where what slips begins to stick"  # behind its name, the beginn
 ZERO = 1e-6  # [-] of an inertia: what is smaller, with its interval, is rounding
 BOUND = "at its bound"  # note of a parameter that ended there
 FAILED = "the fit failed"  # beginning of the note of a fit whose numbers mean nothing
+FLAT = "what was measured is constant"  # beginning of the note of an exact fit of columns that do not change
 # Beginnings of notes that concern every number.
-DOUBTS = (FAILED, "not converged", "the cost jumps", "residuals are autocorrelated")
+DOUBTS = (FAILED, "not converged", "the cost jumps", FLAT, "residuals are autocorrelated")
 TABLE_RECORDS = 3  # records whose own numbers are in the table
 
 
