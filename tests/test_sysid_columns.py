@@ -335,6 +335,8 @@ def test_bad_input_of_a_fit(data, arguments, message):
         ({"cue.x": dr.direction(), "cue.mass": dr.direction()}, "expected a vector"),
         ({("cue.mass",): dr.shares()}, "two or more"),
         ({"cue.x": dr.each(3)}, "expected interval"),
+        ({"cue.mass": (0, 1)}, r"got \(0, 1\): did you mean interval\(0, 1\)\?"),
+        ({"cue.mass": dr.positive}, r"the function positive: call it, positive\(\)"),
         (
             {"cue.mass": dr.positive(), "restitution": dr.real(), "cue.restitution": dr.real()},
             "set the same number: leave one out, or free restitution by bodies and statics only",

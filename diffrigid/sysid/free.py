@@ -18,6 +18,7 @@ value, such as directions, are in `charts`.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import FunctionType
 from typing import Any
 
 import jax
@@ -246,3 +247,12 @@ def _sigmoid(z: np.ndarray) -> np.ndarray:
     """Sigmoid in NumPy, without overflow: for the few numbers of a result, each of which JAX would compile."""
     small = np.exp(-np.abs(z))
     return np.where(z >= 0, 1.0, small) / (1.0 + small)
+
+
+def meant(kind: Any) -> str:
+    """What was given instead of a kind, and what may have been meant."""
+    if isinstance(kind, tuple | list) and len(kind) == 2:
+        return f"{kind!r}: did you mean interval{tuple(kind)!r}?"
+    if isinstance(kind, FunctionType):
+        return f"the function {kind.__name__}: call it, {kind.__name__}()"
+    return f"{kind!r:.80}"

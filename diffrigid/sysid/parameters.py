@@ -20,7 +20,7 @@ from diffrigid.pytree import replace, static
 from diffrigid.state import COEFFICIENTS, State
 from diffrigid.sysid.channels import is_record, parts_of
 from diffrigid.sysid.charts import Chart
-from diffrigid.sysid.free import Each, Free, Prior, Through
+from diffrigid.sysid.free import Each, Free, Prior, Through, meant
 from diffrigid.sysid.sensors import Channel, is_turn
 from diffrigid.world import World
 
@@ -209,7 +209,7 @@ def _make_slot(key: Any, kind: Any, several: bool, scenes: Sequence[Scene], unli
     own, kind = (kind, kind.kind) if isinstance(kind, Through) else (None, kind)
     if not isinstance(kind, Free | Chart):
         raise ValueError(
-            f"free[{key!r}]: expected interval(low, high), positive(), real() or another kind, got {kind!r}"
+            f"free[{key!r}]: expected interval(low, high), positive(), real() or another kind, got {meant(kind)}"
         )
     if own is not None:
         _refuse_written(key, own, unlike)
