@@ -243,7 +243,7 @@ def _dimension(moving: Mapping[str, Body], gravity: Any) -> int:
 def _length(where: str, value: Any) -> int:
     array = numbers(where, value, None)
     if array.shape not in ((2,), (3,)):
-        raise ValueError(f"{where} has shape {array.shape}: expected 2 or 3 numbers, one for each axis, as (0, -9.81)")
+        raise ValueError(f"{where} has shape {array.shape}: expected 2 or 3 numbers, one for each axis")
     return len(array)
 
 
