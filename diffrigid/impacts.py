@@ -148,7 +148,7 @@ class Seen(NamedTuple):
     changes: Changes
     touch: Touch
     impulse: np.ndarray  # (M, D) [N s] on a
-    left: np.ndarray  # (T, N, D) [N s] changes of momentum that the impulses do not explain
+    left: np.ndarray  # (T, N) [N s] sizes of the changes that the impulses do not explain
 
 
 def _seen(trajectory: Trajectory) -> Seen:
@@ -172,8 +172,8 @@ def _parted(trajectory: Trajectory, seen: Seen) -> Trajectory:
         rows = np.flatnonzero(touch.new & (side < moving))
         np.minimum.at(first, (touch.interval[rows], side[rows]), touch.s[rows])
         np.maximum.at(last, (touch.interval[rows], side[rows]), touch.s[rows])
-    size, whole = (np.linalg.norm(leaf, axis=2) for leaf in (seen.left, seen.changes.p))
-    remains = size > REMAINS * (whole.max(1, keepdims=True) + seen.changes.push)
+    whole = seen.changes.sizes()
+    remains = seen.left > REMAINS * (whole.max(1, keepdims=True) + seen.changes.push)
     unclear = ((last - first > ALIKE * h[:, None]) | remains).any(1)
     cuts = []
     for k in np.unique(touch.interval[touch.new & unclear[touch.interval]]):

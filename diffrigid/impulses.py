@@ -59,6 +59,11 @@ class Changes(NamedTuple):
     fall: np.ndarray  # (T, N, D) [m/s^2] likewise
     push: np.ndarray  # (T, N) [N s] size of the impulse of the forces, on it or on what joints connect it with
     joints: Joints
+    gyration: np.ndarray  # (N,) [m] radii, by which what turns is compared with what moves
+
+    def sizes(self) -> np.ndarray:
+        """Sizes (T, N) [N s] of the changes."""
+        return np.linalg.norm(self.p, axis=2) + np.linalg.norm(self.L, axis=2) / self.gyration
 
 
 def changes_of(trajectory: Trajectory) -> Changes:
@@ -78,7 +83,7 @@ def changes_of(trajectory: Trajectory) -> Changes:
         push[:, bodies] = push[:, bodies].max(1, keepdims=True)
     joints = Joints(np.array(ends, int).reshape(-1, 2).T, made)
     fall = forces[..., :dim] / (np.asarray(world.bodies.mass, float)[:, None] * h[:, None, None])
-    return Changes(change[..., :dim], change[..., dim:], forces, fall, push, joints)
+    return Changes(change[..., :dim], change[..., dim:], forces, fall, push, joints, gyration)
 
 
 class Touching(NamedTuple):
@@ -96,10 +101,10 @@ def impulses_at(changes: Changes, touching: Touching) -> tuple[np.ndarray, np.nd
     """Impulses (M, D) [N s] at contacts on their first bodies; the second receive the opposite.
 
     Returns:
-        those, and the changes of momentum that remain, (T, N, D) [N s]; zero of bodies with joints and no contact.
+        those, and the sizes of the changes that remain, (T, N) [N s]; zero of bodies with joints and no contact.
     """
     interval, ends, arms = touching[:3]
-    left = np.where(np.isin(np.arange(changes.p.shape[1]), changes.joints.ends)[:, None], 0.0, changes.p)
+    left = np.where(np.isin(np.arange(changes.p.shape[1]), changes.joints.ends), 0.0, changes.sizes())
     found, moving, joints = np.zeros(arms.shape[1:]), changes.p.shape[1], changes.joints
     order, change = np.argsort(interval, kind="stable"), np.concatenate([changes.p, changes.L], axis=2)
     intervals, firsts = np.unique(interval[order], return_index=True)
@@ -121,7 +126,8 @@ def impulses_at(changes: Changes, touching: Touching) -> tuple[np.ndarray, np.nd
             ], axis=1)  # fmt: skip
             both = change[k, bodies].ravel(), changes.load[k, bodies].ravel()
             found[chosen], rest = _in_cones(A, *both, *(leaf[chosen] for leaf in touching[3:]))
-            left[k, bodies] = rest.reshape(len(bodies), -1)[:, : arms.shape[2]]
+            p, L = np.split(rest.reshape(len(bodies), -1), [arms.shape[2]], axis=1)
+            left[k, bodies] = np.linalg.norm(p, axis=1) + np.linalg.norm(L, axis=1) / changes.gyration[bodies]
     return found, left
 
 

@@ -308,6 +308,18 @@ def test_impacts_of_bodies_with_joints_are_found_wherever_in_an_interval_they_ar
     np.testing.assert_allclose(t, (6 + phase) / 60, atol=2e-3 / 60)
 
 
+def test_two_corners_that_strike_within_a_step_are_told_apart():
+    """An almost level box: both slip, one forwards and then, as it turns, the other backwards."""
+    box = dr.Body(dr.Box(half=(0.1, 0.06)), mass=1.0, x=(0.0, 0.5), v=(1.0, 0.0), w=0.05)
+    scene = dr.scene({"a": box, "floor": FLOOR}, gravity=(0.0, -G), restitution=0.45, friction=0.35)
+    run = dr.rollout(*scene, dt=1 / 60, steps=18)
+    found = dr.contacts(run)
+    assert found.impact.all() and len(found.t) == 2 and 5e-4 < np.diff(found.t)[0] < 1e-3
+    np.testing.assert_allclose(found.impulse[:, 0] / found.impulse[:, 1], [0.35, -0.35], atol=1e-4)
+    lost = run.state.v[-1, 0] - run.state.v[-2, 0] + np.array([0.0, G / 60])
+    np.testing.assert_allclose(found.impulse.sum(0), lost, atol=1e-3)
+
+
 def test_what_slides_into_something_pushes_it_and_not_the_floor():
     """The floor can only change momenta by its friction, and without any by nothing."""
     for mu in (0.0, 0.2):
