@@ -125,13 +125,15 @@ def _of_kind(world: World, group: Any, motion: Sampled, changes: Changes) -> Tou
     stored, _ = gaps(sides[0].take(row_a), poses[0], sides[1].take(row_b), poses[1])
     with np.errstate(invalid="ignore"):  # of a corner that is over no face
         closing = (start - at(SOON * h[k])[0]) / (SOON * h[k])[:, None]
-    apart = (start > slop[:, None]) | (closing * h[k, None] > slop[:, None])
+    fall = np.pad(np.linalg.norm(changes.fall, axis=2), [(0, 0), (0, len(world.static_names))])
+    least = np.maximum(slop / h[k], SUPPORTED * h[k] * np.maximum(fall[k, a[pair]], fall[k, b[pair]]))
+    apart = (start > slop[:, None]) | (closing > least[:, None])  # or strikes at the start
     close = end <= slop[:, None]
     comes, rests = apart & close, ~apart & (close | (stored <= slop[:, None]))
     s = _meeting(at, h[k], comes)
     gap, there = at(s)
-    least = np.where(comes, gap, np.inf).min(1, keepdims=True, initial=np.inf)
-    struck = apart & (gap <= np.minimum(2 * slop + TOGETHER * size[pair], least[:, 0] + 4 * slop)[:, None])
+    nearest = np.where(comes, gap, np.inf).min(1, initial=np.inf)
+    struck = apart & (gap <= np.minimum(2 * slop + TOGETHER * size[pair], nearest + 4 * slop)[:, None])
     parts = []
     for near, place, t in ((struck & comes.any(1)[:, None], there, s), (rests, point, np.zeros_like(s))):
         row, c = np.nonzero(near & ~_repeated(place, near, 10 * slop))
