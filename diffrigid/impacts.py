@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from diffrigid.contact.materials import material
+from diffrigid.contact.materials import material, mixed
 from diffrigid.convert import numbers
 from diffrigid.impulses import Changes, Touching, changes_of, impulses_at
 from diffrigid.pytree import replace
@@ -187,14 +187,16 @@ def _parted(trajectory: Trajectory, seen: Seen) -> Trajectory:
 def _with_states(trajectory: Trajectory, cuts: list[tuple[int, float]]) -> Trajectory:
     """With the states at times s [s] after the beginnings of intervals k, where the world moves as it is stored."""
     world, lengths = trajectory.world, np.diff(trajectory.t)
-    states = [jax.tree.map(lambda leaf, k=k: leaf[k], trajectory.state) for k in range(len(trajectory.t))]
+
+    def stored(k: int) -> State:
+        return jax.tree.map(lambda leaf: leaf[k], trajectory.state)
 
     def moved(k: int, s: float) -> State:
-        return step(world, states[k], s, jax.tree.map(lambda leaf: leaf[k], trajectory.controls))
+        return step(world, stored(k), s, jax.tree.map(lambda leaf: leaf[k], trajectory.controls))
 
     @functools.cache
     def as_stored(k: int) -> bool:
-        off, change = (np.abs(state.v - states[k + 1].v).max() for state in (moved(k, lengths[k]), states[k]))
+        off, change = (np.abs(state.v - stored(k + 1).v).max() for state in (moved(k, lengths[k]), stored(k)))
         return off <= REMAINS * change
 
     kept = [(k, s, moved(k, s)) for k, s in cuts if as_stored(k)]
@@ -209,10 +211,11 @@ def _with_states(trajectory: Trajectory, cuts: list[tuple[int, float]]) -> Traje
 
 
 def _friction(world: World, ends: np.ndarray) -> np.ndarray:
-    """Coefficients (M,) between the colliders `ends` (2, M): `mixed`, in NumPy."""
+    """Coefficients (M,) between the colliders `ends` (2, M)."""
     of_all = material(world, "friction", tuple(range(len(world.names + world.static_names))))
-    (a, b), (own_a, own_b) = (np.asarray(leaf, float)[ends] for leaf in (of_all.value, of_all.given))
-    return 0.5 * ((1.0 + own_a - own_b) * a + (1.0 + own_b - own_a) * b)
+    of_all = jax.tree.map(lambda leaf: np.asarray(leaf, float), of_all)
+    a, b = (jax.tree.map(lambda leaf, side=side: leaf[side], of_all) for side in ends)
+    return np.asarray(mixed(a, b))
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:

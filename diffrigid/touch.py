@@ -23,8 +23,8 @@ STRUCK = 1e-5  # [-] of the impulse of the forces: a smaller change of momentum 
 BEYOND = 1.1  # [-] times the sizes,
 FASTER = 1.5  # [-] and times the path at the first speed: what is further apart does not meet
 NO_SIZE = 1e-9  # [m, N s] where there is no size, no force
-BENT = 0.1  # [-] of the path by the forces: a path that deviates more from that of an even force has an impact,
 SOON = 1e-3  # [-] of an interval, in which the closing speed at its start is found
+BENT = 0.1  # [-] of the path by the forces: a path that deviates more from that of an even force has an impact,
 SPIKE = 1.5  # [-] of the accelerations in the intervals beside it: so does a larger one of a body with joints
 SUPPORTED = 1.2  # [-] of the impulse of the forces: a support balances them, an impact changes the momentum by more
 ASIDE = 1e-6  # [-] of the smaller size: by so much a body is moved to find a normal, which is the rise of the gap,
@@ -51,7 +51,7 @@ class Sampled(NamedTuple):
     q: np.ndarray  # (T+1, N + S, Q)
     v: np.ndarray  # (T+1, N + S, D)
     w: np.ndarray  # (T+1, N + S, A)
-    a: np.ndarray  # (T, N + S, D) [m/s^2] before an impact in the interval; even, without one or with joints
+    a: np.ndarray  # (T, N + S, D) [m/s^2] before an impact in the interval; without one, its mean
 
 
 def touches(world: World, motion: Sampled, changes: Changes) -> Touch:
