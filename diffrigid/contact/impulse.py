@@ -58,9 +58,9 @@ def comes_to_rest(u: Array, rebound: Array, closing_acc: Array, left: Array, res
 
 
 def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
-    """K, (D, D, *batch) [1/kg]: change of relative velocity at the end arms for a unit impulse at the middle arms."""
+    """K, (D, D, *batch) [1/kg]: change of relative velocity at the late arms for a unit impulse at the middle arms."""
     K: Any = 0.0
-    for at, arm, mid in ((at_a, lever.arm_a, lever.mid_a), (at_b, lever.arm_b, lever.mid_b)):
+    for at, arm, mid in ((at_a, lever.late_a, lever.mid_a), (at_b, lever.late_b, lever.mid_b)):
         if at.v is not None:
             dim = at.x.shape[0]
             unit = jnp.eye(dim, dtype=at.x.dtype).reshape(dim, dim, *[1] * (at.x.ndim - 1))
@@ -68,7 +68,9 @@ def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
             K = K + at.inverse_mass[None, None] * unit + turned
     if lever.turn is None:
         return K
-    return K - jax.vmap(lambda row: rotations(len(K)).cross(lever.turn, row))(K)
+    across = rotations(len(K)).cross
+    K = K - jax.vmap(lambda row: across(lever.turn, row))(K)
+    return K + jax.vmap(lambda column: across(lever.turn, column), 1, 1)(K)
 
 
 def impulses(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:

@@ -1,9 +1,14 @@
-"""Lever arms of a contact on its two bodies, at the end and at the middle of the time for which it is held.
+"""Lever arms of a contact on its two bodies, at the end of the time for which it is held, and T/2 before and after.
 
 A resting force acts evenly over that time T, so its impulse acts in the middle, when the contact was at p - (T/2) p',
 the bodies at x - (T/2) v, and the normal was n - (T/2) n'. The arms and the normal of that moment conserve angular
-momentum. The velocity that the impulse must cancel is that at the end, along the normal at the end. With the geometry
-of the end for both, tipping, or sliding over a round body, would be of first order only.
+momentum. With those of the end, tipping, or sliding over a round body, would be of first order only.
+
+The velocity that the impulse must cancel is that at the end. There it has changed the velocity by u, and also the pose,
+by (T/2) u, and so the Jacobian J of the gap: J' (T/2) u in all, where J' is the derivative along u of J times the
+velocity. Second derivatives of a gap are symmetric, so that is (T/2) dJ/dt u: the change u acts at the arms, and along
+the normal, of T/2 after the end. With those of the end, velocities at the end of a step, and so at an impact within it,
+would violate the contact to second order, and derivatives after the impact would be of first order.
 """
 
 from collections.abc import Callable
@@ -28,7 +33,9 @@ class Levers:
 
     arm_a: Array = array("D")  # at the end
     arm_b: Array = array("D")
-    mid_a: Any = array("D", default=None)  # in the middle; None: the same
+    late_a: Array = array("D")  # of changes of velocity, T/2 after the end
+    late_b: Array = array("D")
+    mid_a: Any = array("D", default=None)  # of impulses, T/2 before the end; None: all are the same
     mid_b: Any = array("D", default=None)
     turn: Any = array("A", default=None)  # [rad] of the normal, from the end back to the middle; None: none
     rate: Any = array("D", default=None)  # [m/s] of the point of contact; None: not known
@@ -53,7 +60,7 @@ def levers(
     # Against a static, arms are to a body's own surface, not to the middle of a gap: it did not fall through it.
     mids = (point - at_a.x + half * drift, point - at_b.x - half * drift) if both_move else ends
     if moving is None:
-        return Levers(arm_a=mids[0], arm_b=mids[1])
+        return Levers(arm_a=mids[0], arm_b=mids[1], late_a=mids[0], late_b=mids[1])
     sign = 0.0 if both_move else 1.0 if at_b.v is None else -1.0
     rate = moving.point + 0.5 * sign * moving.gap[None] * normal
     turned = half * (rate - (at_b.v if at_a.v is None else at_a.v - drift))
@@ -64,7 +71,11 @@ def levers(
     if turns:
         turn = -half * rotations(len(normal)).moment(normal, moving.normal)
         turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
-    return Levers(arm_a=ends[0], arm_b=ends[1], mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate)
+    apart = half * drift if both_move else jnp.zeros_like(drift)
+    return Levers(
+        arm_a=ends[0], arm_b=ends[1], late_a=ends[0] - apart + turned, late_b=ends[1] + apart + turned,
+        mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate,
+    )  # fmt: skip
 
 
 def with_rates(

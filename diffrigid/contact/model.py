@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from diffrigid.world import World
 
 IMPACT, HOLD, WEIGH, REVERSE, PUSH = range(5)
+LEFT = 1e-3  # [-] of the way of a fall in a step: a gap that passes before may have left at contacts that rest
 HOLDS = 4  # passes to hold resting contacts until the first impact: to its time in free fall, then each time from there
 
 
@@ -259,8 +260,9 @@ def _demanded(
     began = jnp.maximum(*(at_colliders(anchors.t0, side, -jnp.inf) for side in (strikes.a, strikes.b)))
     held_for = jnp.where(push | ~held, 0.0, strikes.s - began)
     # A gap that is open at the end may close by itself, which the impulse does in half of the time it is held for.
-    may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(strikes.gap, 0.0), held_for), 0.0)
-    of_rest = jnp.where(push | (strikes.gap <= 0), 0.0, may_close)
+    opened = strikes.gap - LEFT * dt[None] ** 2 * jnp.maximum(closing_acc, 0.0)
+    may_close = jnp.minimum(-u - 2.0 * safe_divide(jnp.maximum(opened, 0.0), held_for), 0.0)
+    of_rest = jnp.where(push | (opened <= 0), 0.0, may_close)
     of_impact = jnp.where(stays, 0.0, restitution * u)
     target, force = driving(world, jnp.where(held, of_rest, of_impact))
     most = None if force is None else jnp.where(drives, force * held_for, jnp.inf)

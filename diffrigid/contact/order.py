@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 # Times no longer than eps ** SOON of a step need not be held. Else a gap of rounding, or in double precision the error
 # of the second time until which a contact is held, would take a sweep.
-SOON = 0.25
+SOON = 0.4
+EARLY = 0.1  # [-] share of a longer time until an impact that is left to the next pass, see `_of_clusters`
 
 
 @pytree
@@ -163,7 +164,9 @@ def _of_clusters(
 ) -> tuple[Array, Array]:
     """Until when each body is held, and when it takes part in an impact without restitution; (N, *batch) [s].
 
-    inf where a body is not held, or takes part in no such impact.
+    inf where a body is not held, or takes part in no such impact. Bodies that are held strike somewhat later or earlier
+    than in the free fall that tells the time; if earlier, they would fall back to it. So they are held for most of it
+    first, and then, from there, for the rest, which is a hundred times as accurate.
 
     Args:
         first, first_bounce: (N, *batch) [s] its own next impact, and that with restitution.
@@ -173,9 +176,11 @@ def _of_clusters(
     member = label[None] == label[:, None]
     until, bounce, begins = (jnp.where(member, t[None], jnp.inf).min(1) for t in (first, first_bounce, t0))
     supported = (member & links.of_bodies(jnp.max, rests, False)[None]).any(1) & (until < jnp.inf)
-    waits = until - begins > jnp.finfo(dt.dtype).eps ** SOON * dt[None]
+    wait = until - begins
+    waits = wait > jnp.finfo(dt.dtype).eps ** SOON * dt[None]
     held, along = supported & waits, supported & ~waits & (until < bounce)
-    return jnp.where(held, until, jnp.inf), jnp.where(along, until, jnp.inf)
+    most = jnp.where(wait > EARLY * dt[None], until - EARLY * wait, until)
+    return jnp.where(held, most, jnp.inf), jnp.where(along, until, jnp.inf)
 
 
 def over_islands(reduce: Callable, values: Array, islands: tuple, none: Any) -> Array:

@@ -181,7 +181,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
                 pull = pull + dot(moving.normal, v_rel)[None] * contact.normal
         return Strikes(
             active=gap < 0, s=s, gap=gap, rounding=rounding, deepest=DEEPEST * size, normal=contact.normal,
-            arm_a=lever.arm_a, arm_b=lever.arm_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
+            arm_a=lever.late_a, arm_b=lever.late_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
             K=effective_matrix(at_a, at_b, lever), v_rel=v_rel,
             press=-dot(contact.normal, forces), pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip
