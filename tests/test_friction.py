@@ -179,6 +179,26 @@ def thrown(mu, v, t):
     return jnp.stack([path.x[-1, 0, 0], path.v[-1, 0, 0], path.w[-1, 0, 0]])
 
 
+def test_a_slip_that_turns_is_of_second_order():
+    """A ball thrown across a slope: its slip turns downhill while it lasts."""
+    normal = np.array([np.sin(0.3), 0.0, np.cos(0.3)])
+    ball = dr.Body(dr.Sphere(radius=0.03), mass=0.2, x=0.03 * normal, v=(0.0, 2.0, 0.0))
+    world, start = dr.scene(
+        {"ball": ball, "slope": dr.Static(dr.HalfSpace(normal=normal))}, gravity=(0.0, 0.0, -G), friction=0.05
+    )
+    step = jax.jit(dr.step)
+
+    def end(rate):
+        state = start
+        for _ in range(rate // 2):
+            state = step(world, state, 1 / rate)
+        return state.x
+
+    right = end(960)
+    for rate, bound in ((60, 1.5e-4), (120, 4e-5), (240, 1e-5)):
+        assert_allclose(end(rate), right, rtol=0.0, atol=bound)
+
+
 @pytest.mark.parametrize("case", [(0.3, 3.0, 1.0), (0.3, 0.75, 0.25)])
 def test_ball_slips_then_rolls(case):
     """A disc thrown along the floor without spin: rolls at 2/3 of its speed from v / (3 mu g) on, whatever mu."""

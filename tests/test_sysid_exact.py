@@ -268,6 +268,26 @@ def test_a_fit_that_is_none_says_so(records, column):
     assert again.notes == found.notes
 
 
+def test_steps_that_are_too_long_are_doubted():
+    """Of an arm in air, whose hinge rubs, at the default step: what steps half as long would give is said first.
+
+    Where the residuals are noise to all appearance, as these are, nothing else shows it.
+    """
+    arm = dr.Body(dr.Capsule(radius=0.01, half_length=0.2), mass=0.3, x=(0.2, 0.0))
+    hinge = dr.Revolute("arm", anchor_a=(-0.2, 0.0), friction=0.02)
+    pair = dr.scene({"arm": arm}, joints=[hinge], gravity=(0.0, -9.81), forces={"air": dr.Drag(linear=0.4)})
+    t = np.arange(60) / 20
+    angle = np.asarray(dr.rollout(*pair, dt=1 / 960, times=t)["arm.angle"])
+    data = {"t": t, "arm.angle": angle + 5e-5 * np.random.default_rng(0).standard_normal(len(t))}
+    free = {"revolute.friction": dr.positive(), "air.linear": dr.positive()}
+    found = dr.fit(*pair, data, free=free, progress=False)
+    friction = found["revolute.friction"]
+    assert found.doubts == ("the steps are too long",) and friction.high < 0.02
+    would_be = float(found.notes[0].split(" would be ")[1].split(" ")[0])
+    assert friction.value < would_be and abs(would_be - 0.02) < 0.6 * abs(friction.value - 0.02)
+    assert found.notes[0].endswith("give dt=0.005")
+
+
 def test_a_fit_that_is_none_says_so_before_what_is_not_seen(records):
     r, free = records[0].observations, {"gravity[1]": dr.interval(-20, 20), "p.mass": dr.positive()}
     with pytest.raises(

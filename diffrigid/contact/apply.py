@@ -179,7 +179,7 @@ def _solved(
     guess = barely(strikes, rest_speed)
     if known is not None:  # resting contacts have almost no gaps, so what displaces them back is what undid their loads
         guess = jnp.where(kick > 0, guess, -known.P)
-    P = solve_impulses(strikes, law, mobility, count, rest_speed, lax.stop_gradient(guess))
+    P = solve_impulses(strikes, law, mobility, count, rest_speed, lax.stop_gradient(guess), held_for)
     return strikes, law, held_for, P, stopped(mobility, strikes, P, law, held_for, rest_speed)
 
 

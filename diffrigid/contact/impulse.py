@@ -9,6 +9,8 @@ the contact point,
     slides:  P_t = -mu P_n slip+ / |slip+|                          else; slip+: what P leaves of the slip
     kinetic energy does not rise         a bound kappa <= 1 that acts rarely (Kane's paradox)
 
+Friction of a contact that is held for a time acts against the mean slip of that time: see `_friction_impulse`.
+
 For a round body, and in the plane, this is the textbook law: |gamma_t| <= mu gamma, stick if the impulse that stops the
 slip fits, else slide against it. Where a corner couples the directions Newton's law still holds exactly, and friction
 turns the slip. It acts against the slip that is left, as where contacts are solved together: so impulses are continuous
@@ -73,21 +75,23 @@ def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
     return K + jax.vmap(lambda column: across(lever.turn, column), 1, 1)(K)
 
 
-def impulses(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
+def impulses(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array, began: Array | None = None) -> Array:
     """`contact_law` of C contacts, (C, D, *batch) [N s]; 0 with zero derivative for those not `on` (C, *batch).
 
     These are solved at rest, because far apart the derivative of the law may overflow, and 0 * inf is NaN.
     """
     v, target = jnp.where(on[:, None], v, 0.0), jnp.where(on, target, 0.0)
-    return jnp.where(on[:, None], jax.vmap(contact_law)(K, n, v, target, mu), 0.0)
+    began = None if began is None else jnp.where(on[:, None], began, 0.0)
+    return jnp.where(on[:, None], jax.vmap(contact_law)(K, n, v, target, mu, began), 0.0)
 
 
-def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
+def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array, began: Array | None = None) -> Array:
     """Impulse of one contact, (D, *batch) [N s]; see the module's docstring. Zero if it separates anyway.
 
     Args:
         v: (D, *batch) [m/s] relative velocity before.
         target: (*batch) [m/s] normal velocity after, >= 0.
+        began: (D, *batch) [m/s] relative velocity at the beginning of the time for which it is held; 0: an impact.
 
     Differentiable except at the switches: separating to closing, stick to slip.
     """
@@ -96,7 +100,7 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array
     v_n, *v_t = [dot(e, v) for e in basis]
     gamma = jnp.maximum(target - v_n, 0.0)
     after = [v_i + gamma * k_in for v_i, (k_in, *_) in zip([v_n, *v_t], k, strict=True)]
-    Q = _friction_impulse(k, gamma, after[1:], mu)
+    Q = _friction_impulse(k, gamma, after[1:], mu, None if began is None else [dot(e, began) for e in basis[1:]])
     gained = sum(Q[i] * k[i][j] * Q[j] for i in axes for j in axes)
     kappa = within_energy(0.5 * gamma * (v_n + target), sum(Q[i] * after[i] for i in axes), gained)
     P = [gamma + kappa * Q[0], *(kappa * Q_t for Q_t in Q[1:])]
@@ -116,15 +120,24 @@ def _in_contact_frame(K: Array, n: Array) -> tuple[list[Array], list[list[Array]
     return basis, [[dot(e, m) * effective_mass for m in moved] for e in basis], effective_mass
 
 
-def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array) -> list:
+def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array, began: list | None) -> list:
     """Impulse that friction adds to gamma n, in the contact frame; the normal velocity is unchanged.
+
+    A slip in space may turn while the contact is held. Friction against the slip at the end would be of first order, so
+    it acts against the sum of that and the one in the beginning. The less it lacks to stop the slip, the less the
+    latter counts, so that impulses are continuous from slipping to sticking.
 
     Args:
         k, gamma: scaled as in `_in_contact_frame`, like the result.
         slip: tangential velocity after gamma n [m/s].
+        began: tangential velocity in the beginning [m/s]; None: where the slip keeps its direction, as in the plane.
     """
     stop = _stopping_impulse(k, slip)
-    sticks = safe_sqrt(sum(P * P for P in stop[1:])) <= mu * (gamma + stop[0])
+    needed, bound = safe_sqrt(sum(P * P for P in stop[1:])), mu * (gamma + stop[0])
+    sticks = needed <= bound
+    if began is not None:
+        lacks = jnp.clip(1.0 - safe_divide(bound, needed), 0.0, 1.0)
+        slip = [s + lacks * s0 for s, s0 in zip(slip, began, strict=True)]
     # Where it sticks no slip is left, and it has no direction: another one slides there, without friction.
     slip, gamma = [jnp.where(sticks, 1.0, s) for s in slip], jnp.where(sticks, 0.0, gamma)
     slide = (_slide_in_plane if len(k) == 2 else _slide_in_space)(k, gamma, slip, mu)

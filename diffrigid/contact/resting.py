@@ -61,7 +61,7 @@ class Law(NamedTuple):
 
 
 def solve_impulses(
-    strikes: Strikes, law: Law, mobility: Mobility, count: Array, rest_speed: Array, guess: Array
+    strikes: Strikes, law: Law, mobility: Mobility, count: Array, rest_speed: Array, guess: Array, T: Array
 ) -> Array:
     """Impulses of all active contacts, (C, D, *batch) [N s] on body a of each.
 
@@ -72,10 +72,14 @@ def solve_impulses(
         count: (N, *batch) number of active contacts of each body.
         rest_speed: (*batch) [m/s] speed that is slow in these worlds.
         guess: (C, D, *batch) [N s] impulses to begin with; of many solutions the one near to it is taken.
+        T: (C, *batch) [s] time over which the impulse of a resting contact has acted, else 0.
     """
     target, mu, most = law
+    began = None
+    if strikes.normal.shape[1] == 3:
+        began = jnp.where(T > 0, 1.0, 0.0)[:, None] * (strikes.v_rel - T[:, None] * strikes.pull)
     if not mobility.joined and are_alone(strikes.a, strikes.b, len(count)):
-        return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu)
+        return impulses(strikes.active, strikes.K, strikes.normal, strikes.v_rel, target, mu, began)
     if most is not None and len(strikes.a) == 1:
         return _only_row(strikes, target, most, mobility)
     joined = tuple(not mobility.joined.isdisjoint(pair) for pair in zip(strikes.a, strikes.b, strict=True))
@@ -84,7 +88,7 @@ def solve_impulses(
     shared = strikes.active & ((others > 1) | flags(joined, count))
     by_itself, alone = strikes.active & ~shared, jnp.zeros_like(strikes.v_rel)
     if not all(joined):
-        given = by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu
+        given = by_itself, strikes.K, strikes.normal, strikes.v_rel, target, mu, began
         alone = lax.cond(any_world(by_itself), recomputed(impulses, rest_speed), _none, *given)
     cone = Cone(
         on=shared.astype(others.dtype), sharing=jnp.maximum(others, 1.0), scale=_scale(strikes), normal=strikes.normal,
@@ -130,6 +134,6 @@ def are_alone(a: tuple[int, ...], b: tuple[int, ...], moving: int) -> bool:
     return len(set(bodies)) == len(bodies)
 
 
-def _none(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array) -> Array:
-    del on, K, n, target, mu
+def _none(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array, began: Array | None) -> Array:
+    del on, K, n, target, mu, began
     return jnp.zeros_like(v)

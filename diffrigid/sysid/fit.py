@@ -26,7 +26,9 @@ from diffrigid.sysid.points import by_column, linear_of
 from diffrigid.sysid.remarks import beside_a_jump, failed, remarks_on, sticking
 from diffrigid.sysid.result import Fit
 from diffrigid.sysid.setup import Problem, fitted_scenes, make_problem, make_starts, reach_of, with_noise
+from diffrigid.sysid.step_check import too_long
 from diffrigid.sysid.summary import Summary, versions
+from diffrigid.sysid.table import CORRELATED, FAILED
 from diffrigid.world import World
 
 SQUARES = Squares()
@@ -200,6 +202,9 @@ def finish(
         remarks = [*jump, *(remark for remark in remarks if remark == INTERRUPTED)]
     remarks = [*remarks, *remarks_on(problem, scenes, in_units, strikes), *stuck]
     parameters, notes = describe(problem, shared, own, linear, uncertainty, residuals, loss, remarks)
+    if not any(remark.startswith(FAILED) for remark in remarks):
+        correlated = any(note.startswith(CORRELATED) for note in notes)
+        remarks = [*remarks, *too_long(problem, point, best, linear, uncertainty, correlated)]
     parameters, spans = spanning(problem, parameters, np.asarray(point.z.shared, float)[:, alike])
     summary = Summary(
         parameters=parameters, noise=all_noise(problem), costs=costs[order], orders=orders, agree=int(alike.sum()),

@@ -103,7 +103,8 @@ class Fit:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Why not to believe any of the numbers, in the first words of such `notes`: "the fit failed", "not converged",
-        "the cost jumps", "what was measured is constant", "residuals are autocorrelated"; () if there is none."""
+        "the cost jumps", "what was measured is constant", "the steps are too long", "residuals are autocorrelated"; ()
+        if there is none."""
         return self.summary.doubts
 
     @property

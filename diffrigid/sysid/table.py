@@ -19,8 +19,10 @@ ZERO = 1e-6  # [-] of an inertia: what is smaller, with its interval, is roundin
 BOUND = "at its bound"  # note of a parameter that ended there
 FAILED = "the fit failed"  # beginning of the note of a fit whose numbers mean nothing
 FLAT = "what was measured is constant"  # beginning of the note of an exact fit of columns that do not change
+LONG = "the steps are too long"  # likewise where shorter ones would change the numbers
+CORRELATED = "residuals are autocorrelated"  # likewise of one that misses something
 # Beginnings of notes that concern every number.
-DOUBTS = (FAILED, "not converged", "the cost jumps", FLAT, "residuals are autocorrelated")
+DOUBTS = (FAILED, "not converged", "the cost jumps", FLAT, LONG, CORRELATED)
 TABLE_RECORDS = 3  # records whose own numbers are in the table
 
 
