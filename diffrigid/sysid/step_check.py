@@ -17,6 +17,7 @@ from diffrigid.devices import everywhere
 from diffrigid.forces import is_constant
 from diffrigid.shapes import Disc, Sphere
 from diffrigid.sysid.covariance import Linear, Uncertainty, eliminated, information, inverse
+from diffrigid.sysid.intervals import coordinates_of
 from diffrigid.sysid.levenberg import Numbers, Point, point_at
 from diffrigid.sysid.losses import Squares
 from diffrigid.sysid.noise import exact_columns
@@ -30,6 +31,7 @@ from diffrigid.world import World
 
 FAR = 1.0  # [-] of a standard deviation: numbers that move by more with steps half as long are doubted
 LOOK = 0.3  # [-] likewise in the first half, with the deviations that it would give: more is worth the whole
+LEAST = 1e-5  # [-] of a large change of a number: less does not matter, however well it is known
 SHORTER = 0.25  # [-] of the step: the one that is proposed
 
 
@@ -44,16 +46,24 @@ def too_long(
     few = any(len(group.data.lengths) < 2 for group in problem.groups)
     if few or all(_is_exact(run.world) for run in problem.runs) or exact_columns(problem):
         return []
-    if not correlated and _in_deviations(*_first_look(problem, point, best)).max(initial=0.0) < LOOK:
+    scales = np.array([number.scale for number in coordinates_of(problem)[: linear.shared]])
+
+    def in_deviations(moved: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        deviations, size = np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.abs(moved)
+        where = (deviations > 0) & (size > LEAST * scales)
+        return np.divide(size, deviations, out=np.zeros_like(moved), where=where)
+
+    if not correlated and in_deviations(*_first_look(problem, point, best)).max(initial=0.0) < LOOK:
         return []
     moved = _moved(linear, _changes(problem, point, best))
-    ratios = _in_deviations(moved, uncertainty.covariance)
+    ratios = in_deviations(moved, uncertainty.covariance)
     if not ratios.max(initial=0.0) > FAR:
         return []
     worst = int(np.argmax(ratios))
     slot, rows = next((slot, rows) for slot, rows in pieces(problem.shared) if rows.start <= worst < rows.stop)
     z, about = np.asarray(point.z.shared, float)[rows, best], first_value(problem, slot)
-    value, would_be = (np.asarray(slot.kind.value(each, about), float) for each in (z, z + moved[rows]))
+    ends = (jnp.asarray(each, jnp.result_type(about)) for each in (z, z + moved[rows]))
+    value, would_be = (np.asarray(slot.kind.value(end, about), float) for end in ends)
     part = np.unravel_index(np.argmax(np.abs(would_be - value)), value.shape)
     name = slot.name + (f"[{', '.join(map(str, part))}]" if part else "")
     places = digits(value[part], would_be[part], would_be[part], 3)
@@ -71,11 +81,6 @@ def _is_exact(world: World) -> bool:
     free = not (world.pairs or world.crowd)
     round_ones = all(isinstance(shape, Disc | Sphere) for shape in solid) and centred and (world.dim == 2 or smooth)
     return is_constant(world.forces) and not world.joints and (free or round_ones)
-
-
-def _in_deviations(moved: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return np.divide(np.abs(moved), deviations, out=np.zeros_like(moved), where=deviations > 0)
 
 
 def _moved(linear: Linear, changes: Sequence[np.ndarray]) -> np.ndarray:
