@@ -490,7 +490,11 @@ def test_profile_agrees_with_the_jacobian_where_the_problem_is_nearly_linear():
     # The interval from the Jacobian, to second order in its relative half width.
     assert_allclose([profile.low, profile.high], [value.low, value.high], rtol=2e-3)
     assert profile.rise.argmin() == len(profile.rise) // 2
-    assert profile.open == ()
+    assert profile.open == () and profile.doubts == ()
+    doubtful = replace(
+        found, summary=replace(found.summary, notes=("the cost jumps beside the best fit", *found.notes))
+    )
+    assert repr(dr.profile(doubtful, "spring.stiffness")).splitlines()[0].endswith("(profile; the cost jumps)")
 
 
 def test_profile_says_where_it_is_open():
@@ -503,7 +507,7 @@ def test_profile_says_where_it_is_open():
     size = np.linalg.norm(by_c - by_k * (by_k @ by_c) / (by_k @ by_k)) / sigma
     assert profile.open == ("below",) and profile.low == 0.0
     assert_allclose(profile.high, 1.96 / size, rtol=0.01)  # between values that are refined twice
-    assert f"0 to {profile.high:.5g} (profile, open below)" in repr(profile)
+    assert f"0 to {profile.high:.5g} (profile, open below; not converged)" in repr(profile)
     table = repr(sysid.with_profiles(found, [profile]))
     assert "profile, open below" in table and f"0 .. {profile.high:.3g}" in table
 

@@ -8,7 +8,8 @@ The velocity that the impulse must cancel is that at the end. There it has chang
 by (T/2) u, and so the Jacobian J of the gap: J' (T/2) u in all, where J' is the derivative along u of J times the
 velocity. Second derivatives of a gap are symmetric, so that is (T/2) dJ/dt u: the change u acts at the arms, and along
 the normal, of T/2 after the end. With those of the end, velocities at the end of a step, and so at an impact within it,
-would violate the contact to second order, and derivatives after the impact would be of first order.
+would violate the contact to second order, and derivatives after the impact would be of first order. What that turn adds
+to the precession of a spin in space, where J is not that of coordinates, is left out.
 """
 
 from collections.abc import Callable

@@ -34,6 +34,7 @@ class ProfileLikelihood:
     low: float  # 95 % interval; the bound of the parameter where the rise does not reach the level
     high: float
     open: tuple[str, ...] = ()  # "below", "above": where it does not
+    doubts: tuple[str, ...] = ()  # of the fit: why not to believe it
 
     @property
     def apart(self) -> np.ndarray:
@@ -50,7 +51,8 @@ class ProfileLikelihood:
         return ", ".join(["profile", *parts])
 
     def __repr__(self) -> str:
-        interval = f"{self.name}: 95 % interval {self.low:.5g} to {self.high:.5g} ({self.note})"
+        remarks = "; ".join((self.note, *self.doubts))
+        interval = f"{self.name}: 95 % interval {self.low:.5g} to {self.high:.5g} ({remarks})"
         head = f"{'value':>12} {'rise':>12}   of the cost; at the ends of the interval {self.level:.3g}"
         rows = (f"{value:12.5g} {rise:12.4g}" for value, rise in zip(self.values, self.rise, strict=True))
         return "\n".join([interval, head, *rows])
@@ -87,7 +89,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
     low, high = (float(kind.value(np.array([fit.shared[index] + end]))[0]) for end in ends)
     opened = tuple(word for word, end in zip(("below", "above"), ends, strict=True) if np.isnan(end))
     low, high = kind.low if np.isnan(low) else low, kind.high if np.isnan(high) else high
-    return ProfileLikelihood(name, kind.value(z), rise, level, low, high, opened)
+    return ProfileLikelihood(name, kind.value(z), rise, level, low, high, opened, fit.doubts)
 
 
 def with_profiles(fit: Fit, profiles: Sequence[ProfileLikelihood]) -> Fit:
