@@ -371,6 +371,22 @@ def test_interrupting_returns_the_best_so_far(records, monkeypatch):
     assert np.isfinite(found.costs).all()
 
 
+def test_progress_is_a_line_that_changes_or_one_now_and_then(fit, records, monkeypatch, capsys):
+    """Over one line where it is asked for; where nobody watches only what takes long prints, and not to the output."""
+
+    def printed(**progress):
+        dr.fit(*point(), records, free=FREE, **progress)
+        return capsys.readouterr()
+
+    out, err = printed(progress=True)
+    assert out.startswith("fit: iteration   0") and out.strip().splitlines()[-1].startswith("fit: done") and not err
+    assert printed() == ("", "")
+    monkeypatch.setattr(sys.modules["diffrigid.sysid.fit"], "SILENCE", -1.0)
+    out, err = printed()
+    assert not out and len(err.splitlines()) > 1 and "\r" not in err and err.startswith("fit: iteration")
+    assert printed(progress=False) == ("", "")
+
+
 def test_a_fit_that_has_not_converged_says_so(records):
     found = dr.fit(*point(), records, free=FREE, progress=False, iterations=1)
     assert found.notes[0].startswith("not converged after 1 iterations")

@@ -33,6 +33,7 @@ from diffrigid.world import World
 
 SQUARES = Squares()
 NOT_SMALL = 0.1  # [-] of the spread of a column: larger residuals that are not noise are named before a blind parameter
+SILENCE = 30.0  # [s] after which a line is printed where nobody watches
 LINE = 80  # characters of a line of progress, so that one covers the one before
 AGREES, AGREES_RELATIVE = 0.5, 1e-3  # of the loss, and of the best: a start within their sum agrees with the best
 
@@ -89,7 +90,8 @@ def fit(
             with. A fit that has not converged by then says so.
         seed: of the random starts.
         resume: an earlier Fit, or the result of `load_fit`: the first start is there.
-        progress: print a line as it goes; default: where the output is a terminal or a notebook.
+        progress: print a line as it goes; default: where the output is a terminal or a notebook, elsewhere one to the
+            standard error each half minute.
 
     Interrupting it returns the best so far.
 
@@ -262,15 +264,21 @@ def _stage(width: float, window: Any) -> str:
 
 
 def _printer(progress: bool | None, starts: int) -> Callable[[str, int, np.ndarray], None]:
-    """Make a function that prints the iteration of a stage and the best cost, over one line."""
-    if progress is None:
-        progress = sys.stdout.isatty() or "ipykernel" in sys.modules
+    """Make a function that prints the iteration of a stage and the best cost.
+
+    Over one line; by default, where the output is neither a terminal nor a notebook, a line of long fits now and then.
+    """
+    watched = progress or (progress is None and (sys.stdout.isatty() or "ipykernel" in sys.modules))
+    printed = time.monotonic()
 
     def report(stage: str, count: int, costs: np.ndarray) -> None:
-        if progress:
-            end = "\n" if count < 0 else "\r"
-            label = "done" if count < 0 else f"iteration {count:3d}{stage}"
-            line = f"fit: {label}, {starts} starts, best cost {float(np.min(costs)):.6g}"
-            print(f"{line:<{LINE}}", end=end, flush=True)
+        nonlocal printed
+        label = "done" if count < 0 else f"iteration {count:3d}{stage}"
+        line = f"fit: {label}, {starts} starts, best cost {float(np.min(costs)):.6g}"
+        if watched:
+            print(f"{line:<{LINE}}", end="\n" if count < 0 else "\r", flush=True)
+        elif progress is None and time.monotonic() - printed > SILENCE:
+            print(line, file=sys.stderr, flush=True)
+            printed = time.monotonic()
 
     return report
