@@ -366,6 +366,26 @@ def test_friction_that_turns_back_feels_that_of_the_other_hinge():
     assert_allclose(rubs[1], turned[1], atol=1e-3)
 
 
+def test_air_answers_the_friction_of_a_hinge_within_the_step():
+    """An arm that a hinge and the air slow: w' = -(c r^2 w + tau) / I; of first order, it would be off by 4e-3 rad/s."""
+
+    def end(tau, c):
+        arm = dr.Body(None, mass=0.3, inertia=0.004, x=(0.2, 0.0), v=(0.0, 1.0), w=5.0)
+        hinge = dr.Revolute("arm", anchor_a=(-0.2, 0.0), friction=tau)
+        world, state = dr.scene({"arm": arm}, joints=[hinge], forces={"air": dr.Drag(linear=c)})
+        return dr.rollout(world, state, dt=1 / 120, steps=60).state.w[-1, 0, 0]
+
+    def expected(tau, c):
+        inertia = 0.004 + 0.3 * 0.2**2
+        a, b = c * 0.2**2 / inertia, tau / inertia
+        return (5.0 + b / a) * jnp.exp(-0.5 * a) - b / a
+
+    p = jnp.asarray(0.02), jnp.asarray(0.4)
+    (speed, slopes), (right, right_slopes) = (jax.value_and_grad(f, (0, 1))(*p) for f in (jax.jit(end), expected))
+    assert_allclose(speed, right, atol=5e-5)
+    assert_allclose(slopes, right_slopes, rtol=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.0, 50.0])
 def test_what_a_joint_of_a_linkage_does_acts_in_the_middle_of_a_step(speed):

@@ -281,11 +281,12 @@ def test_steps_that_are_too_long_are_doubted():
     data = {"t": t, "arm.angle": angle + 5e-5 * np.random.default_rng(0).standard_normal(len(t))}
     free = {"revolute.friction": dr.positive(), "air.linear": dr.positive()}
     found = dr.fit(*pair, data, free=free, progress=False)
-    friction = found["revolute.friction"]
-    assert found.doubts == ("the steps are too long",) and friction.high < 0.02
-    would_be = float(found.notes[0].split(" would be ")[1].split(" ")[0])
-    assert friction.value < would_be and abs(would_be - 0.02) < 0.6 * abs(friction.value - 0.02)
+    air, _, would_be = found["air.linear"], *found.notes[0].split(" air.linear[1] would be ")
+    assert found.doubts == ("the steps are too long",) and air.low[1] > 0.4
+    assert abs(float(would_be.split(" ")[0]) - 0.4) < 0.5 * abs(air.value[1] - 0.4)
     assert found.notes[0].endswith("give dt=0.005")
+    shorter = dr.fit(*pair, data, free=free, dt=0.005, progress=False)
+    assert not shorter.doubts and shorter["air.linear"].low[1] < 0.4
 
 
 def test_a_fit_that_is_none_says_so_before_what_is_not_seen(records):

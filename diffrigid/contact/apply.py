@@ -15,7 +15,14 @@ from jax import Array, lax
 from diffrigid.branches import choose
 from diffrigid.contact.anchors import Anchors, struck
 from diffrigid.contact.known import Known, beside, loads, reversing, weighed
-from diffrigid.contact.mobility import Mobility, jointed, momentum_changes, relative_changes, velocities
+from diffrigid.contact.mobility import (
+    Mobility,
+    answers_of_forces,
+    jointed,
+    momentum_changes,
+    relative_changes,
+    velocities,
+)
 from diffrigid.contact.order import Links, companions, over_islands
 from diffrigid.contact.resting import Law, Strikes, are_alone, barely, solve_impulses
 from diffrigid.contact.rolling import beside_rolling, rolling_reversing, rolling_stops, with_rows
@@ -210,7 +217,10 @@ def _posed(world: "World", flight: Flight, t: Array, ago: Array) -> tuple[Array,
         q, link = linked(t)
         joined = frozenset(end for ends in ends_of(world.joints) for end in ends if end < len(q))
         inertia = jax.vmap(so.world_inverse)(world.bodies.inertia, q)
-        return q, jointed(world.joints, link, linked(t - ago)[1], ago, inertia, joined), link
+        x, v, L = (jax.vmap(of)(flight, t) for of in (position, velocity, angular_momentum))
+        state = State(x=x, q=q, v=v, w=jax.vmap(so.unspin)(flight.inverse_inertia, q, L))
+        answering = answers_of_forces(world, state, 2.0 * ago.max(0))
+        return q, jointed(world.joints, link, linked(t - ago)[1], ago, inertia, joined, answering), link
     q = jax.vmap(orientation)(flight, t)
     inverse = jax.vmap(so.world_inverse)(flight.inverse_inertia, q)
     return q, Mobility(inverse_mass=flight.inverse_mass, inverse_inertia=inverse), None

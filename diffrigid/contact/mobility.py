@@ -6,7 +6,7 @@ the N (D + A) components of the twists of all bodies, body after body.
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +15,16 @@ from jax import Array
 from diffrigid.contact.cone import put
 from diffrigid.contact.sums import at_colliders, between_bodies, pair_sum, pairs_of, side_sum
 from diffrigid.fence import unfused
+from diffrigid.forces import is_constant, total_wrench, within
 from diffrigid.gathers import sum_rows
 from diffrigid.linear import identity, matvec
 from diffrigid.linkage import Linkage, damped_later, is_damped, spread
-from diffrigid.numerics import dot, unit_vector
+from diffrigid.numerics import dot, safe_divide, unit_vector
 from diffrigid.pytree import array, pytree, replace, static
-from diffrigid.state import rotations
+from diffrigid.state import State, rotations
+
+if TYPE_CHECKING:
+    from diffrigid.world import World
 
 
 @pytree
@@ -94,13 +98,18 @@ def _joined(parts: list[Array]) -> Array:
 
 
 def jointed(
-    joints: tuple, link: Linkage, then: Linkage, ago: Array, inertia: Array, joined: frozenset[int]
-) -> Mobility:
+    joints: tuple, link: Linkage, then: Linkage, ago: Array, inertia: Array, joined: frozenset[int],
+    answering: Callable | None,
+) -> Mobility:  # fmt: skip
     """Mobility of bodies connected by joints: the full matrix G. Inertias are in world axes.
 
     The joints react to an impulse as they are when it acts, `then`, the time `ago` (N, *batch) [s] before the end; by
-    their damping since; and as they are at the end, `link`. With one reaction only, a force that acts evenly over a
-    step, in its middle, would be of first order only. G is used so often that it is made once, column by column.
+    their damping since, as do forces; and as they are at the end, `link`. With one reaction only, a force that acts
+    evenly over a step, in its middle, would be of first order only. G is used so often that it is made once, column by
+    column.
+
+    Args:
+        answering: see `answers_of_forces`.
     """
     moving, *batch = link.inverse_mass.shape
     D, size = link.groups[0].a.x.shape[1], link.sides.shape[3]
@@ -115,11 +124,36 @@ def jointed(
     def twist(unit: Array) -> Array:
         dv, dw, dL = answered(then, unit[:, :D], unit[:, D:])
         momentum = jnp.concatenate([dv / link.inverse_mass[:, None], dL], axis=1)
+        twists = jnp.concatenate([dv, dw], axis=1)
         if any(map(is_damped, joints)):
-            momentum = damped_later(joints, then, jnp.concatenate([dv, dw], axis=1), momentum, ago)
+            momentum = damped_later(joints, then, twists, momentum, ago)
+        if answering is not None:
+            taken = ago[:, None] * answering(dv, dw)
+            # As by an implicit step, so that what damps much within a step stops a body, but does not throw it back.
+            share = safe_divide(-(taken * twists).sum((0, 1)), (momentum * twists).sum((0, 1)))
+            momentum = momentum + taken / (1.0 + jnp.maximum(share, 0.0))[None, None]
         return jnp.concatenate(answered(link, momentum[:, :D], momentum[:, D:])[:2], axis=1).reshape(-1, *batch)
 
     return replace(free(link), inertia=inertia, matrix=jax.vmap(twist, out_axes=1)(units), joined=joined)
+
+
+def answers_of_forces(world: "World", state: State, span: Array) -> Callable | None:
+    """How forces answer to changes of the velocities: a linear map from these, of v (N, D, *batch) [m/s] and w (N, A,
+    *batch) [rad/s], to changes of forces and torques (N, D + A, *batch); None: no force depends on velocities.
+
+    Args:
+        state: of all bodies, perhaps at their own times.
+        span: (*batch) [s] time for which they act.
+    """
+    forces = tuple(f for f in world.forces if not is_constant((f,)) and getattr(f, "control", None) is None)
+    if not forces:
+        return None
+
+    def wrenches(v: Array, w: Array) -> Array:
+        wrench = total_wrench(within(forces, span), world.bodies, replace(state, v=v, w=w), None)
+        return jnp.concatenate([wrench.F, jnp.zeros_like(w) if wrench.tau is None else wrench.tau], axis=1)
+
+    return lambda dv, dw: jax.jvp(wrenches, (state.v, state.w), (dv, dw))[1]
 
 
 def free(link: Linkage) -> Mobility:
