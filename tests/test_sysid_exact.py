@@ -529,6 +529,20 @@ def test_profile_says_where_it_is_open():
     assert "profile, open below" in table and f"0 .. {profile.high:.3g}" in table
 
 
+def test_profile_ends_at_a_cliff(monkeypatch):
+    """Where the cost rises at once, between two of the values that were tried, the end is looked for between them."""
+    found = dr.fit(*spring(2.0), spring_record(), free={"spring.stiffness": dr.positive()}, progress=False)
+    z, deviation = found.shared[0], np.sqrt(found.covariance[0, 0])
+
+    def rises(fit, index, at):
+        return np.where(at < z - 1.3 * deviation, 1e4, 0.5 * ((at - z) / deviation) ** 2)
+
+    monkeypatch.setattr(sys.modules["diffrigid.sysid.profile"], "_rises", rises)
+    profile = dr.profile(found, "spring.stiffness")
+    assert_allclose(np.log(profile.low), z - 1.3 * deviation, rtol=0.0, atol=0.02 * deviation)
+    assert_allclose(np.log(profile.high), z + found.uncertainty.quantile * deviation, rtol=0.0, atol=0.02 * deviation)
+
+
 def spring(stiffness, damping=0.3):
     """A point on a damped spring to the world: x'' = -k x - c x'."""
     force = dr.SpringDamper(a="p", anchor_a=(0.0, 0.0), anchor_b=(0.0, 0.0), stiffness=stiffness, damping=damping)
@@ -637,19 +651,21 @@ def test_a_jump_of_the_cost_beside_the_best_fit_is_noticed(fit, monkeypatch):
     at = Numbers(jnp.asarray(fit.shared)[:, None], jnp.asarray(fit.own)[..., None])
     best = point_at(fit.problem.groups, at)
 
-    def remarks(rows, leap):
+    def remarks(rows, leap, seen=1.0):
         def leaps(groups, z):
             moved = point_at(groups, z)
             return moved._replace(residuals=tuple(r + leap for r in moved.residuals))
 
         monkeypatch.setattr("diffrigid.sysid.remarks.point_at", leaps)
-        linear = dr.replace(fit.linear, rows=tuple(row + rows for row in fit.linear.rows))
+        slopes = tuple(slopes * np.append(np.ones(slopes.shape[1] - 1), seen) for slopes in fit.linear.slopes)
+        linear = dr.replace(fit.linear, rows=tuple(row + rows for row in fit.linear.rows), slopes=slopes)
         return beside_a_jump(fit.problem, best, 0, linear, fit.loss)
 
     (jump,) = remarks(1e-2, 5.0)
     assert jump.startswith("the cost jumps beside the best fit")
     assert not remarks(1e-2, 0.0)  # it falls there, as the slopes say
     assert not remarks(0.0, 5.0)  # at the bottom there is nothing to look for
+    assert not remarks(1e-2, 0.0, seen=1e-15)  # a number of which the slopes are rounding is left where it is
     steep = dr.replace(fit.linear, slopes=tuple(1e12 * slopes for slopes in fit.linear.slopes))
     (wild,) = beside_a_jump(fit.problem, best, 0, steep, fit.loss)
     assert wild.startswith("the slopes of the residuals are enormous: the motion is unstable")

@@ -19,6 +19,8 @@ NOT_DETERMINED = 10.0  # standard deviation of z from which on that extent is no
 FAR = 5.0  # extent in z instead: a factor e^5
 FURTHER = 3  # how often that is then doubled, where the cost has not risen to the level
 REFINED = 2  # how often the level is bracketed again after such steps
+STEEP = 4.0  # [-] of the level: beyond it a rise is that of a cliff, which is bracketed
+CLIFF = 4  # how often, at most
 PROFILE_ITERATIONS = 30  # iterations for the other numbers
 AT_BOUND = 15.0  # z at which a bounded number is at its bound to single precision
 
@@ -128,10 +130,12 @@ def _extended(
         while longer < FURTHER and rise[outer := np.argmax(side * z)] <= level and (last := side * z[outer]) < most:
             z, rise = also(side * np.minimum(last + (last - side * middle) * share, most))
             longer += 1
-        refinements = REFINED if longer and rise[np.argmax(side * z)] > level else 0
-        for _ in range(refinements):  # the steps were long: again between the points about the level
+        for k in range(CLIFF if rise[np.argmax(side * z)] > level else 0):
             below = (side * z)[(rise <= level) & (side * z >= side * middle)].max()
             above = (side * z)[(rise > level) & (side * z > below)].min()
+            # Again between the points about the level: the steps were long, or the cost rises at once.
+            if not (longer and k < REFINED) and rise[side * z == above].min() <= STEEP * level:
+                break
             z, rise = also(side * (below + (above - below) * share[:-1]))
     z, order = np.unique(z, return_index=True)
     rise = rise[order]

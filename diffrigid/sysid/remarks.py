@@ -16,7 +16,7 @@ from diffrigid.joint_motion import fields_of, moving_side
 from diffrigid.paths import read, write
 from diffrigid.shapes import Disc, Sphere
 from diffrigid.state import rotations
-from diffrigid.sysid.covariance import Linear
+from diffrigid.sysid.covariance import ROUNDING, Linear
 from diffrigid.sysid.diagnosis import LARGE, RARE, whiteness
 from diffrigid.sysid.first_rows import is_begun
 from diffrigid.sysid.levenberg import Numbers, Point, cost_of, point_at
@@ -121,8 +121,8 @@ def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, los
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a / b, 0 where b is 0."""
-    return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
+    """a / b, 0 where b is 0 or, of squares of slopes, rounding: what nothing measured shows is not moved."""
+    return np.divide(a, b, out=np.zeros_like(a), where=b > ROUNDING**2 * b.max(initial=0.0))
 
 
 def failed(problem: Problem, residuals: Sequence[dict[str, np.ndarray]], strikes: bool, least: float = AS_LARGE) -> str:

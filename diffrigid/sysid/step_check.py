@@ -32,7 +32,8 @@ from diffrigid.world import World
 FAR = 1.0  # [-] of a standard deviation: numbers that move by more with steps half as long are doubted
 LOOK = 0.3  # [-] likewise in the first half, with the deviations that it would give: more is worth the whole
 LEAST = 1e-5  # [-] of a large change of a number: less does not matter, however well it is known
-SHORTER = 0.25  # [-] of the step: the one that is proposed
+SHORTER, ENOUGH = 0.25, 0.25  # [-] of the step, at most, and of a deviation: a step so short is proposed that its
+# error, of second order, is no more than that
 
 
 def too_long(
@@ -66,10 +67,12 @@ def too_long(
     value, would_be = (np.asarray(slot.kind.value(end, about), float) for end in ends)
     part = np.unravel_index(np.argmax(np.abs(would_be - value)), value.shape)
     name = slot.name + (f"[{', '.join(map(str, part))}]" if part else "")
-    places = digits(value[part], would_be[part], would_be[part], 3)
+    change = abs(would_be[part] - value[part])
+    places = digits(value[part], value[part] - change, value[part] + change, 3)
+    shorter = problem.dt * min(SHORTER, float(np.sqrt(ENOUGH / ratios[worst])))
     return [
         f"{LONG}: with half of {problem.dt:.3g} s {name} would be {would_be[part]:.{places}g} instead of "
-        f"{value[part]:.{places}g}, {ratios[worst]:.2g} standard deviations away: give dt={SHORTER * problem.dt:.2g}"
+        f"{value[part]:.{places}g}, {ratios[worst]:.2g} standard deviations away: give dt={shorter:.2g}"
     ]
 
 
