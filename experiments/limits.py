@@ -122,7 +122,16 @@ def wheel():
     return [abs(slope(dt) - right) for dt in STEPS], f"of {right:.2g}"
 
 
-CASES = {case.__name__: case for case in (rod, dome, across, rider, arms, hold, wheel)}
+def domino():
+    """A domino that topples from 0.1 rad and slips back and forth (friction 0.3), 0.45 s: its angle."""
+    b, h, tilt = 0.05, 0.3, 0.1
+    x = np.array([b * np.cos(tilt) - h * np.sin(tilt), b * np.sin(tilt) + h * np.cos(tilt)])
+    body = dr.Body(dr.Box(half=(b, h)), mass=1.0, x=x, angle=tilt, w=1.0, v=(-x[1], x[0]))
+    pair = dr.scene({"domino": body, "floor": FLOOR}, friction=0.3, **DOWN)
+    return off(pair, 0.45, lambda state: np.arctan2(state.q[0, 1], state.q[0, 0])), "rad"
+
+
+CASES = {case.__name__: case for case in (rod, dome, across, rider, arms, hold, wheel, domino)}
 
 
 def main():

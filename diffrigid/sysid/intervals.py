@@ -46,7 +46,10 @@ def describe(
     problem: Problem, shared: np.ndarray, own: np.ndarray, linear: Linear, uncertainty: Uncertainty,
     residuals: tuple[dict[str, np.ndarray], ...], loss: Loss, remarks: Sequence[str],
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
-    """Parameters with intervals, and the notes under the table, besides the `remarks` on the fit as a whole."""
+    """Parameters with intervals, and the notes under the table, besides the `remarks` on the fit as a whole.
+
+    Why not to believe them comes before what they say of single numbers.
+    """
     lost = any(remark.startswith(FAILED) for remark in remarks)  # then slopes tell nothing of the measured motion
     blind = [] if lost else blind_directions(linear, coordinates_of(problem))
     found = tuple(_parameters(problem, shared, own, linear, uncertainty, blind))
@@ -58,7 +61,7 @@ def describe(
     )
     ended = [p.name for p in parameters if p.note == BOUND]
     notes = _notes(problem, linear, uncertainty, blind, ended)
-    return parameters, (*notes, *_doubts(problem, linear, residuals, loss))
+    return parameters, (*_doubts(problem, linear, residuals, loss), *notes)
 
 
 def spanning(
