@@ -81,8 +81,7 @@ def resting(task: Task, gaps: Gaps) -> Array:
     near, slow = (NEAR * task.size)[None], task.slow[None]
     touching = touches(gap, v, acc, near, slow)
     # A contact that closes at a third of the speed of its fall would be back within the step, whatever e <= 1.
-    falls = jnp.maximum(-jnp.minimum(acc, gaps.acceleration), 0.0)
-    least = slow + falls * jnp.maximum(task.span, 0.0)[None] / 3.0
+    least = slow + jnp.maximum(-acc, 0.0) * jnp.maximum(task.span, 0.0)[None] / 3.0
     return touching | (touches(gap, v, acc, near, least) & (touching.any(0) | task.rested)[None])
 
 
@@ -176,17 +175,13 @@ def polish(task: Task, gaps: Gaps, rests: Array, level: Array, s: Array) -> Poli
 
 
 def _time_to(height: Array, v: Array, acc: Array) -> Array:
-    """Time until height + v t + acc t^2 / 2 next falls through zero; negative if inside and closing; inf: never.
-
-    What rises from below, but not up to zero: until it is as deep again.
-    """
+    """Time until height + v t + acc t^2 / 2 next falls through zero; negative if inside and closing; inf: never."""
     D = v * v - 2.0 * acc * height
     root = safe_sqrt(D)
     until_closed = jnp.where((D < 0) & (height > 0), jnp.inf, safe_divide(2.0 * height, root - v))
     returning = jnp.where(acc < 0, safe_divide(v + root, -acc), jnp.inf)
     sunk = (height < 0) & (acc < 0) & (D < 0)
-    as_deep = safe_divide(2.0 * jnp.maximum(v, 0.0), -acc)
-    return jnp.where(sunk, as_deep, jnp.where(v < 0, until_closed, returning))
+    return jnp.where(sunk, 0.0, jnp.where(v < 0, until_closed, returning))
 
 
 def _least(times: Array) -> Array:

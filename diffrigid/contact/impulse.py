@@ -70,9 +70,7 @@ def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
             K = K + at.inverse_mass[None, None] * unit + turned
     if lever.turn is None:
         return K
-    across = rotations(len(K)).cross
-    K = K - jax.vmap(lambda row: across(lever.turn, row))(K)
-    return K + jax.vmap(lambda column: across(lever.turn, column), 1, 1)(K)
+    return K - jax.vmap(lambda row: rotations(len(K)).cross(lever.turn, row))(K)
 
 
 def impulses(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array, began: Array | None = None) -> Array:
@@ -136,7 +134,9 @@ def _friction_impulse(k: list, gamma: Array, slip: list, mu: Array, began: list 
     needed, bound = safe_sqrt(sum(P * P for P in stop[1:])), mu * (gamma + stop[0])
     sticks = needed <= bound
     if began is not None:
-        lacks = jnp.clip(1.0 - safe_divide(bound, needed), 0.0, 1.0)
+        at_end, first = jnp.stack(slip), jnp.stack(began)
+        alike = safe_divide(jnp.maximum(dot(at_end, first), 0.0), norm(at_end) * norm(first))  # 0 where it turns back
+        lacks = alike * jnp.clip(1.0 - safe_divide(bound, needed), 0.0, 1.0)
         slip = [s + lacks * s0 for s, s0 in zip(slip, began, strict=True)]
     # Where it sticks no slip is left, and it has no direction: another one slides there, without friction.
     slip, gamma = [jnp.where(sticks, 1.0, s) for s in slip], jnp.where(sticks, 0.0, gamma)

@@ -2,14 +2,15 @@
 
 A resting force acts evenly over that time T, so its impulse acts in the middle, when the contact was at p - (T/2) p',
 the bodies at x - (T/2) v, and the normal was n - (T/2) n'. The arms and the normal of that moment conserve angular
-momentum. With those of the end, tipping, or sliding over a round body, would be of first order only.
+momentum. The velocity that the impulse must cancel is that at the end, along the normal at the end. With the geometry
+of the end for both, tipping, or sliding over a round body, would be of first order only.
 
-The velocity that the impulse must cancel is that at the end. There it has changed the velocity by u, and also the pose,
-by (T/2) u, and so the Jacobian J of the gap: J' (T/2) u in all, where J' is the derivative along u of J times the
-velocity. Second derivatives of a gap are symmetric, so that is (T/2) dJ/dt u: the change u acts at the arms, and along
-the normal, of T/2 after the end. With those of the end, velocities at the end of a step, and so at an impact within it,
-would violate the contact to second order, and derivatives after the impact would be of first order. What that turn adds
-to the precession of a spin in space, where J is not that of coordinates, is left out.
+At an impact within the step that velocity has to be right to higher order, or derivatives after the impact are of first
+order. Until then the impulse has changed the velocity by u, and also the pose, by (T/2) u, and so the Jacobian J of the
+gap: by J' (T/2) u in all, where J' is the derivative along u of J times the velocity. Second derivatives of a gap are
+symmetric, so that is (T/2) dJ/dt u: the change u acts at the arms of T/2 after the end. So it is on a half-space, also
+at the end of a step; where the normal turns, only until an impact; nowhere for what lies flat and cannot turn. What the
+normal then adds, and in space what the change of pose adds to the precession of a spin, is left out.
 """
 
 from collections.abc import Callable
@@ -34,7 +35,7 @@ class Levers:
 
     arm_a: Array = array("D")  # at the end
     arm_b: Array = array("D")
-    late_a: Array = array("D")  # of changes of velocity, T/2 after the end
+    late_a: Array = array("D")  # of changes of velocity: T/2 after the end, or as at the end
     late_b: Array = array("D")
     mid_a: Any = array("D", default=None)  # of impulses, T/2 before the end; None: all are the same
     mid_b: Any = array("D", default=None)
@@ -43,8 +44,9 @@ class Levers:
 
 
 def levers(
-    contact: Contacts, moving: Contacts | None, turns: bool, at_a: Placed, at_b: Placed, drift: Array, T: Array
-) -> Levers:
+    contact: Contacts, moving: Contacts | None, turns: bool, at_a: Placed, at_b: Placed, drift: Array, T: Array,
+    rolls: Array,
+) -> Levers:  # fmt: skip
     """Lever arms of one contact.
 
     Args:
@@ -53,6 +55,7 @@ def levers(
         turns: whether the normal may turn.
         drift: (D, *batch) [m/s] half the velocity of centre a relative to centre b; 0 at a static.
         T: (*batch) [s] time for which it is held, else 0.
+        rolls: (*batch) bool: changes of velocity act at late arms.
     """
     normal, point, gap = contact.normal, contact.point, contact.gap
     inside = 0.5 * gap[None] * normal
@@ -67,14 +70,23 @@ def levers(
     turned = half * (rate - (at_b.v if at_a.v is None else at_a.v - drift))
     size: Any = sum(dot(arm, arm) for arm, at in zip(ends, (at_a, at_b), strict=True) if at.v is not None)
     # Limited to the length of the arms: a body that turns faster than the steps resolve must not flip them.
-    turned = safe_divide(size, size + 4.0 * dot(turned, turned))[None] * turned
+    limit = safe_divide(size, size + 4.0 * dot(turned, turned))[None]
+    turned = limit * turned
     turn = None
     if turns:
         turn = -half * rotations(len(normal)).moment(normal, moving.normal)
         turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
     apart = half * drift if both_move else jnp.zeros_like(drift)
+    later = [turned - apart, turned + apart]
+    if len(normal) == 3:  # a spin about the normal only turns the slip, and friction is against that at the end
+        spins = [
+            jnp.zeros_like(end) if at.w is None else dot(normal, at.w)[None] * rotations(3).cross(normal, end)
+            for end, at in zip(ends, (at_a, at_b), strict=True)
+        ]
+        later = [way - limit * half * spin for way, spin in zip(later, spins, strict=True)]
+    later = [jnp.where(rolls[None], way, 0.0) for way in later]
     return Levers(
-        arm_a=ends[0], arm_b=ends[1], late_a=ends[0] - apart + turned, late_b=ends[1] + apart + turned,
+        arm_a=ends[0], arm_b=ends[1], late_a=ends[0] + later[0], late_b=ends[1] + later[1],
         mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate,
     )  # fmt: skip
 

@@ -41,7 +41,7 @@ class Arms:
     arm_b: Array = array("C", "D")
     mid_a: Any = array("C", "D", default=None)  # where impulses act; None: where velocities are, at the arms
     mid_b: Any = array("C", "D", default=None)
-    turn: Any = array("C", "A", default=None)  # [rad] rotation of the impulses to where they act, of velocities back
+    turn: Any = array("C", "A", default=None)  # [rad] rotation of the impulses to where they act
     jac: Any = array("R", "2", "D + A", default=None)  # Jacobian of each joint coordinate for the twists of a and b
     mid_jac: Any = array("R", "2", "D + A", default=None)  # the same at the time when its impulse acts
     spin: Any = array("K", default=None)
@@ -176,16 +176,10 @@ def velocities(mobility: Mobility, dp: Array, dL: Array) -> tuple[Array, Array, 
 def relative_changes(arms: Any, dv: Array, dw: Array) -> Array:
     """Change of the relative velocity at every contact, (C, D, *batch) [m/s], for changes of the bodies' velocities."""
     if min(arms.b) >= len(dv):  # with statics only
-        changes = _at_ends(arms, 0, dv, dw)
-    elif min(arms.a) >= len(dv):
-        changes = -_at_ends(arms, 1, dv, dw)
-    else:
-        changes = _at_ends(arms, 0, dv, dw) - _at_ends(arms, 1, dv, dw)
-    if arms.turn is None:
-        return changes
-    points = _points(arms)
-    turned = changes[:points] + jax.vmap(rotations(dv.shape[1]).cross)(arms.turn[:points], changes[:points])
-    return jnp.concatenate([turned, changes[points:]])
+        return _at_ends(arms, 0, dv, dw)
+    if min(arms.a) >= len(dv):
+        return -_at_ends(arms, 1, dv, dw)
+    return _at_ends(arms, 0, dv, dw) - _at_ends(arms, 1, dv, dw)
 
 
 def _at_ends(arms: Any, side: int, dv: Array, dw: Array) -> Array:
@@ -270,9 +264,8 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     mid_a, mid_b = J_a, J_b
     if arms.mid_a is not None or arms.jac is not None:
         mid_a, mid_b = (by_units(arm, arms.mid_jac, side) for side, arm in enumerate(mids(arms)))
-    if arms.turn is not None:  # P + turn x P, by the velocities that it acts on; these turn back likewise
-        by_turn = [jax.vmap(jax.vmap(so.cross, (None, 0)))(arms.turn, J) for J in (J_a, J_b, mid_a, mid_b)]
-        (J_a, J_b), (mid_a, mid_b) = (J_a + by_turn[0], J_b + by_turn[1]), (mid_a - by_turn[2], mid_b - by_turn[3])
+    if arms.turn is not None:  # P + turn x P, by the velocities that it acts on
+        mid_a, mid_b = (J - jax.vmap(jax.vmap(so.cross, (None, 0)))(arms.turn, J) for J in (mid_a, mid_b))
 
     def answers(J):  # impulses of each contact for unit twists of one of its bodies
         return jnp.swapaxes(jax.vmap(answer)(jnp.swapaxes(J, 0, 1)), 0, 1)

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 IMPACT, HOLD, WEIGH, REVERSE, PUSH = range(5)
 LEFT = 1e-3  # [-] of the way of a fall in a step: a gap that passes before may have left at contacts that rest
-HOLDS = 4  # passes to hold resting contacts until the first impact: for most of its time in free fall, then from there
+HOLDS = 6  # passes to hold resting contacts until the first impact: for most of its time in free fall, then from there
 
 
 @pytree

@@ -32,8 +32,7 @@ class Strikes:
     arm_b: Array = array("C", "D")
     mid_a: Any = array("C", "D", default=None)  # [m] arm of impulses, half the held time before s; None: arm_a
     mid_b: Any = array("C", "D", default=None)
-    # [rad] rotation of the impulse at s to where it acts, and of changes of velocity back to s; None: none
-    turn: Any = array("C", "A", default=None)
+    turn: Any = array("C", "A", default=None)  # [rad] rotation of the impulse at s to where it acts; None: none
     K: Array = array("C", "D", "D")  # [1/kg] effective matrix
     # [m/s] of a against b at the contact point, before the impulse; where gaps are closed (PUSH) the gap along the
     # normal, [m], so that an impulse is [kg m] and changes positions.

@@ -168,9 +168,11 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
     size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
     T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
+    rolls = ((active & (rests | rested)).sum(0) < len(at_a.x)) & ((s < dt) | (not turns))
 
     def each(contact: Contacts, moving: Contacts | None, gap: Array) -> Strikes:
-        lever = levers(replace(contact, gap=jnp.where(apart, contact.gap, 0.0)), moving, turns, at_a, at_b, drift, T)
+        at_gap = replace(contact, gap=jnp.where(apart, contact.gap, 0.0))
+        lever = levers(at_gap, moving, turns, at_a, at_b, drift, T, rolls)
         sides = at_a, (a.flight, lever.arm_a), at_b, (b.flight, lever.arm_b)
         forces = difference(lambda at, of: acceleration(of[0], at, s, of[1]), *sides)
         v_rel = relative_velocity(at_a, lever.arm_a, at_b, lever.arm_b)
