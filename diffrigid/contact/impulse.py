@@ -89,7 +89,8 @@ def contact_law(K: Array, n: Array, v: Array, target: Array, mu: Array, began: A
     Args:
         v: (D, *batch) [m/s] relative velocity before.
         target: (*batch) [m/s] normal velocity after, >= 0.
-        began: (D, *batch) [m/s] relative velocity at the beginning of the time for which it is held; 0: an impact.
+        began: (D, *batch) [m/s] relative velocity at the beginning of the time for which it is held, or 0 in
+            an impact; None: the slip keeps its direction.
 
     Differentiable except at the switches: separating to closing, stick to slip.
     """

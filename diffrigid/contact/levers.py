@@ -77,18 +77,24 @@ def levers(
         turn = -half * rotations(len(normal)).moment(normal, moving.normal)
         turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
     apart = half * drift if both_move else jnp.zeros_like(drift)
-    later = [turned - apart, turned + apart]
-    if len(normal) == 3:  # a spin about the normal only turns the slip, and friction is against that at the end
-        spins = [
-            jnp.zeros_like(end) if at.w is None else dot(normal, at.w)[None] * rotations(3).cross(normal, end)
-            for end, at in zip(ends, (at_a, at_b), strict=True)
-        ]
-        later = [way - limit * half * spin for way, spin in zip(later, spins, strict=True)]
-    later = [jnp.where(rolls[None], way, 0.0) for way in later]
+    ways = _less_spin(normal, ends, (turned - apart, turned + apart), (at_a, at_b), limit * half)
+    later = [jnp.where(rolls[None], way, 0.0) for way in ways]
     return Levers(
         arm_a=ends[0], arm_b=ends[1], late_a=ends[0] + later[0], late_b=ends[1] + later[1],
         mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate,
     )  # fmt: skip
+
+
+def _less_spin(normal: Array, arms: tuple, ways: tuple, at: tuple, span: Array) -> list[Array]:
+    """The ways [m] of two arms in a span [s] without what a spin about the normal adds, which only turns the slip:
+    friction is against that at the end. In the plane there is no such spin."""
+    if len(normal) == 2:
+        return list(ways)
+    spins = [
+        jnp.zeros_like(arm) if one.w is None else dot(normal, one.w)[None] * rotations(3).cross(normal, arm)
+        for arm, one in zip(arms, at, strict=True)
+    ]
+    return [way - span * spin for way, spin in zip(ways, spins, strict=True)]
 
 
 def with_rates(

@@ -22,8 +22,7 @@ from diffrigid.pytree import array, pytree, replace
 if TYPE_CHECKING:
     from diffrigid.world import World
 
-# Times no longer than eps ** SOON of a step need not be held. Else a gap of rounding, or in double precision the error
-# of the second time until which a contact is held, would take a sweep.
+# Times no longer than eps ** SOON of a step need not be held. Else a gap of rounding would take a sweep.
 SOON = 0.4
 EARLY = 0.1  # [-] share of a longer time until an impact that is left to the next pass, see `_of_clusters`
 
