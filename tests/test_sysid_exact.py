@@ -514,6 +514,24 @@ def test_profile_agrees_with_the_jacobian_where_the_problem_is_nearly_linear():
     assert repr(dr.profile(doubtful, "spring.stiffness")).splitlines()[0].endswith("(profile; the cost jumps)")
 
 
+def test_profile_of_a_component():
+    """A fall is linear in its start and velocity, so that intervals are those of the Jacobian."""
+    fall = record(np.random.default_rng(7), 30, 0.0)
+    free = {"p.x": dr.real(), "p.v": dr.real()}
+    found = dr.fit(*point(), [fall], free=free, noise={"p.x": NOISE}, progress=False)
+    profile = dr.profile(found, "p.v[1]")
+    value = found["p.v[1]"]
+    assert_allclose([profile.low, profile.high], [value.low, value.high], rtol=1e-6)
+    moved = replace(profile, low=-1.0, high=1.0)
+    after = sysid.with_profiles(found, [moved])["p.v"]
+    assert_allclose([after.low, after.high], [[found["p.v[0]"].low, -1.0], [found["p.v[0]"].high, 1.0]])
+    assert after.note.endswith("[1] profile")
+    with pytest.raises(ValueError, match=r"'p.v' has 2 numbers: expected one of them, such as 'p.v\[0\]'"):
+        dr.profile(found, "p.v")
+    with pytest.raises(ValueError, match=r"no shared number 'p.v\[2\]': expected one of \['p.x', 'p.v'\]"):
+        dr.profile(found, "p.v[2]")
+
+
 def test_profile_says_where_it_is_open():
     """Without damping, the cost rises by (a c)^2 / 2 with a = |slopes by c, freed of those by k| / noise, from c = 0."""
     t, sigma = np.arange(60) / 15, 2e-3

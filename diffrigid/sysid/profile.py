@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
+from diffrigid.catalogue import component
 from diffrigid.convert import at_least_one
 from diffrigid.sysid.free import Free
 from diffrigid.sysid.levenberg import Numbers, cost_of, levenberg
@@ -61,7 +62,8 @@ class ProfileLikelihood:
 
 
 def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
-    """Profile of a shared number, its interval being where the cost rises by less than t^2 / 2.
+    """Profile of a shared number, or of a component, "ball.v[0]": its interval is where the cost rises by less than
+    t^2 / 2.
 
     Unlike an interval from the Jacobian it accounts for curvature: it may be lopsided, or open. Where the rise does not
     reach that level, however far the number goes, the data give no limit and the interval ends at the bound.
@@ -70,7 +72,7 @@ def profile(fit: Fit, name: str, points: int = 9) -> ProfileLikelihood:
         points: an odd number of values, the fitted one in the middle; more follow where the interval is wide.
 
     Raises:
-        ValueError: a loaded fit; no such shared number, or a vector; points that are even, or fewer than 3.
+        ValueError: a loaded fit; no such shared number, or a whole vector; points that are even, or fewer than 3.
 
     Example:
         >>> curve = dr.profile(found, "restitution")
@@ -101,13 +103,17 @@ def with_profiles(fit: Fit, profiles: Sequence[ProfileLikelihood]) -> Fit:
         ValueError: a loaded fit.
     """
     checked_fit(fit, "with_profiles")
-    found = {p.name: p for p in profiles}
 
     def changed(p: Parameter) -> Parameter:
-        if p.name not in found:
-            return p
-        low, high = (np.full_like(p.value, end) for end in (found[p.name].low, found[p.name].high))
-        return replace(p, low=low, high=high, note="; ".join(filter(None, (p.note, found[p.name].note))))
+        for found in profiles:
+            whole, k = component(found.name)
+            if p.name in (found.name, whole):
+                part = f"[{k}] " if p.name == whole and k is not None else ""
+                low, high = np.array(p.low, float), np.array(p.high, float)
+                at = k if part else ...
+                low[at], high[at] = found.low, found.high
+                p = replace(p, low=low, high=high, note="; ".join(filter(None, (p.note, part + found.note))))
+        return p
 
     return replace(fit, summary=replace(fit.summary, parameters=tuple(map(changed, fit.parameters))))
 
@@ -143,13 +149,19 @@ def _extended(
 
 
 def _kind_and_index(fit: Fit, name: str) -> tuple[Free, int]:
-    """Kind of a shared number, and its place in z."""
+    """Kind of a shared number, alone or a component of a vector, and its place in z."""
+    whole, k = component(name)
     for slot, rows in pieces(fit.problem.shared):
-        if slot.name == name:
-            if slot.size != 1 or not isinstance(slot.kind, Free):
-                raise ValueError(f"profile: {name!r} is not one number; tie or fix its components first")
+        if not isinstance(slot.kind, Free):
+            continue
+        if slot.name == name and slot.size == 1:
             return slot.kind, rows.start
-    raise ValueError(f"profile: no shared parameter {name!r}; there are {[slot.name for slot in fit.problem.shared]}")
+        if slot.name == name:
+            raise ValueError(f"profile: {name!r} has {slot.size} numbers: expected one of them, such as '{name}[0]'")
+        if slot.name == whole and k in range(slot.size) and fit[whole].value.ndim == 1:
+            return slot.kind, rows.start + k
+    there = [slot.name for slot in fit.problem.shared if isinstance(slot.kind, Free)]
+    raise ValueError(f"profile: no shared number {name!r}: expected one of {there}, or a component, 'ball.v[0]'")
 
 
 def _rises(fit: Fit, index: int, z: np.ndarray) -> np.ndarray:
