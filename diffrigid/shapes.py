@@ -298,5 +298,6 @@ def traced(leaf) -> bool:
 
 def floats(leaf) -> Array:
     """A leaf as a float array; records may hold plain numbers and tuples until they are put into a world."""
-    leaf = jnp.asarray(leaf)
+    # Through numpy, which joins numbers of different kinds even where JAX is told not to.
+    leaf = jnp.asarray(np.asarray(leaf) if isinstance(leaf, list | tuple) and not traced(leaf) else leaf)
     return leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf.astype(float)

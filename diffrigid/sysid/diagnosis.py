@@ -149,7 +149,8 @@ def weak(covariance: np.ndarray, coordinates: Sequence[Coordinate], ended: Colle
             continue
         factor = f"a factor {np.exp(s):.2g}" if s < ANY_FACTOR else "any factor"
         known = f"known to {factor if c.logarithmic else f'+- {s:.2g}'}"
-        words = "its interval is as wide as its bounds let it be" if c.bounded else known
+        wide = "its interval is as wide as its bounds let it be; dr.profile shows whether a side of it is excluded"
+        words = wide if c.bounded else known
         notes.append(f"{c.name} is hardly seen: {words}")
     return notes
 
