@@ -183,8 +183,8 @@ apply = matrix_product  # I^-1 tau, both in world axes
 def mobility(inverse: Array, r: Array, mid: Array) -> Array:
     """Velocity at r for a unit impulse at mid, by rotation alone: (3, 3, *batch), -[r] I^-1 [mid]."""
     cross_rows = jax.vmap(cross, in_axes=(None, 0))
-    half = cross_rows(r, jnp.swapaxes(inverse, 0, 1))  # rows: r x (column of I^-1)
-    return jnp.swapaxes(cross_rows(mid, jnp.swapaxes(half, 0, 1)), 0, 1)
+    by_moments = jnp.swapaxes(cross_rows(r, inverse), 0, 1)  # [r] I^-1: I^-1 is symmetric, its rows are its columns
+    return cross_rows(mid, by_moments)  # a row times -[mid] is mid x row
 
 
 @jax.custom_jvp

@@ -406,12 +406,12 @@ def over_a_dome_in_theory(shape, mu, start, radius):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape, rolling", [(dr.Disc, 2e-5), (dr.Sphere, 4e-5)])
-def test_what_is_round_slides_and_rolls_over_a_dome(shape, rolling):
+@pytest.mark.parametrize("shape", [dr.Disc, dr.Sphere])
+def test_what_is_round_slides_and_rolls_over_a_dome(shape):
     """The normal turns: of second order in the step, and so are the slopes."""
     motion, theory = partial(over_a_dome, shape), partial(over_a_dome_in_theory, shape)
     way = with_slopes(motion)
-    for mu, value, slope in ((0.0, 4e-5, 1e-4), (100.0, rolling, 1e-4)):
+    for mu, value, slope in ((0.0, 4e-5, 1e-4), (100.0, 1e-5, 1e-4)):
         p = tuple(map(jnp.asarray, (mu, 0.2, 1.0)))
         end, slopes = way(*p)
         assert_allclose(end, theory(*p), atol=value)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from diffrigid import so3
+from diffrigid import so2, so3
 
 RANDOM = np.random.default_rng(0)
 SIZES = {"vector": (3,), "quaternion": (4,), "matrix": (3, 3)}
@@ -63,3 +63,11 @@ def test_logarithm_of_small_turns_is_exact():
     angle = np.geomspace(1e-7, 1e-2, 41)
     r = angle * np.array([0.6, -0.48, 0.64])[:, None]
     assert_allclose(so3.log(so3.exp(jnp.asarray(r))), r, rtol=1e-14)
+
+
+@pytest.mark.parametrize("so, D", [(so2, 2), (so3, 3)])
+def test_mobility_is_the_velocity_at_one_arm_for_an_impulse_at_another(so, D):
+    r, mid, impulse = RANDOM.normal(size=(3, D))
+    inverse = np.asarray(0.7) if D == 2 else np.array([[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [-0.1, 0.2, 0.9]])
+    expected = so.cross(so.apply(inverse, so.moment(mid, impulse)), r)
+    assert_allclose(so.mobility(inverse, r, mid) @ impulse, expected, atol=1e-14)

@@ -59,7 +59,7 @@ def comes_to_rest(u: Array, rebound: Array, closing_acc: Array, left: Array, res
     return (u <= rest_speed) | (2.0 * rebound <= closing_acc * left)
 
 
-def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
+def effective_matrix(at_a: Placed, at_b: Placed, normal: Array, lever: Levers) -> Array:
     """K, (D, D, *batch) [1/kg]: change of relative velocity at the late arms for a unit impulse at the middle arms."""
     K: Any = 0.0
     for at, arm, mid in ((at_a, lever.late_a, lever.mid_a), (at_b, lever.late_b, lever.mid_b)):
@@ -70,7 +70,8 @@ def effective_matrix(at_a: Placed, at_b: Placed, lever: Levers) -> Array:
             K = K + at.inverse_mass[None, None] * unit + turned
     if lever.turn is None:
         return K
-    return K - jax.vmap(lambda row: rotations(len(K)).cross(lever.turn, row))(K)
+    K = K - jax.vmap(lambda row: rotations(len(K)).cross(lever.turn, row))(K)
+    return K + normal[:, None] * matvec(jnp.swapaxes(K, 0, 1), lever.lean)[None]
 
 
 def impulses(on: Array, K: Array, n: Array, v: Array, target: Array, mu: Array, began: Array | None = None) -> Array:

@@ -5,12 +5,16 @@ the bodies at x - (T/2) v, and the normal was n - (T/2) n'. The arms and the nor
 momentum. The velocity that the impulse must cancel is that at the end, along the normal at the end. With the geometry
 of the end for both, tipping, or sliding over a round body, would be of first order only.
 
-At an impact within the step that velocity has to be right to higher order, or derivatives after the impact are of first
-order. Until then the impulse has changed the velocity by u, and also the pose, by (T/2) u, and so the Jacobian J of the
-gap: by J' (T/2) u in all, where J' is the derivative along u of J times the velocity. Second derivatives of a gap are
-symmetric, so that is (T/2) dJ/dt u: the change u acts at the arms of T/2 after the end. So it is on a half-space, also
-at the end of a step; where the normal turns, only until an impact; nowhere for what lies flat and cannot turn. What the
-normal then adds, and in space what the change of pose adds to the precession of a spin, is left out.
+At an impact within the step that velocity has to be right to higher order, or derivatives after the impact are of
+first order. Until then the impulse has changed the velocity by u, and the pose by (T/2) u. With J the Jacobian of the
+gap, the normal velocity J v has changed by
+
+    J u + (T/2) (d(J v)/dx) u = (J + (T/2) dJ/dt) u
+
+because second derivatives of a gap are symmetric: the change u acts at the arms, and along the normal, of T/2 after the
+end. So it is for what is free to turn, not for what lies flat. A slip is measured at these arms, too, but along the
+tangents of the end: as these turn they take up the normal velocity that is left, which is zero. What in space the
+change of pose adds to the precession of a spin is left out.
 """
 
 from collections.abc import Callable
@@ -40,6 +44,7 @@ class Levers:
     mid_a: Any = array("D", default=None)  # of impulses, T/2 before the end; None: all are the same
     mid_b: Any = array("D", default=None)
     turn: Any = array("A", default=None)  # [rad] of the normal, from the end back to the middle; None: none
+    lean: Any = array("D", default=None)  # [-] change of the normal from the end to T/2 after it; None: none
     rate: Any = array("D", default=None)  # [m/s] of the point of contact; None: not known
 
 
@@ -55,7 +60,7 @@ def levers(
         turns: whether the normal may turn.
         drift: (D, *batch) [m/s] half the velocity of centre a relative to centre b; 0 at a static.
         T: (*batch) [s] time for which it is held, else 0.
-        rolls: (*batch) bool: changes of velocity act at late arms.
+        rolls: (*batch) bool: changes of velocity act late.
     """
     normal, point, gap = contact.normal, contact.point, contact.gap
     inside = 0.5 * gap[None] * normal
@@ -72,16 +77,17 @@ def levers(
     # Limited to the length of the arms: a body that turns faster than the steps resolve must not flip them.
     limit = safe_divide(size, size + 4.0 * dot(turned, turned))[None]
     turned = limit * turned
-    turn = None
+    turn = lean = None
     if turns:
         turn = -half * rotations(len(normal)).moment(normal, moving.normal)
         turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
+        lean = jnp.where(rolls[None], rotations(len(normal)).cross(-turn, normal), 0.0)
     apart = half * drift if both_move else jnp.zeros_like(drift)
     ways = _less_spin(normal, ends, (turned - apart, turned + apart), (at_a, at_b), limit * half)
-    later = [jnp.where(rolls[None], way, 0.0) for way in ways]
+    late_a, late_b = (end + jnp.where(rolls[None], way, 0.0) for end, way in zip(ends, ways, strict=True))
     return Levers(
-        arm_a=ends[0], arm_b=ends[1], late_a=ends[0] + later[0], late_b=ends[1] + later[1],
-        mid_a=mids[0] - turned, mid_b=mids[1] - turned, turn=turn, rate=rate,
+        arm_a=ends[0], arm_b=ends[1], late_a=late_a, late_b=late_b, mid_a=mids[0] - turned, mid_b=mids[1] - turned,
+        turn=turn, lean=lean, rate=rate,
     )  # fmt: skip
 
 

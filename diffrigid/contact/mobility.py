@@ -42,6 +42,8 @@ class Arms:
     mid_a: Any = array("C", "D", default=None)  # where impulses act; None: where velocities are, at the arms
     mid_b: Any = array("C", "D", default=None)
     turn: Any = array("C", "A", default=None)  # [rad] rotation of the impulses to where they act
+    normal: Any = array("C", "D", default=None)  # with `lean` only
+    lean: Any = array("C", "D", default=None)  # [-] change of the normal, to that along which changes of velocity act
     jac: Any = array("R", "2", "D + A", default=None)  # Jacobian of each joint coordinate for the twists of a and b
     mid_jac: Any = array("R", "2", "D + A", default=None)  # the same at the time when its impulse acts
     spin: Any = array("K", default=None)
@@ -188,6 +190,8 @@ def _at_ends(arms: Any, side: int, dv: Array, dw: Array) -> Array:
     ends, arm = ((arms.a, arms.arm_a), (arms.b, arms.arm_b))[side]
     v, w = at_colliders(dv, ends, 0.0), at_colliders(dw, ends, 0.0)
     parts = [v[:points] + jax.vmap(so.cross)(w[:points], arm[:points])]
+    if arms.lean is not None:
+        parts[0] = parts[0] + jax.vmap(dot)(arms.lean[:points], parts[0])[:, None] * arms.normal[:points]
     if arms.spin is not None:
         parts.append(_as_vectors(w[points:rows_from], so.D))
     if arms.jac is not None:
@@ -264,6 +268,8 @@ def bodies_matrix(answer: Callable, arms: Any, mobility: Mobility) -> Array:
     mid_a, mid_b = J_a, J_b
     if arms.mid_a is not None or arms.jac is not None:
         mid_a, mid_b = (by_units(arm, arms.mid_jac, side) for side, arm in enumerate(mids(arms)))
+    if arms.lean is not None:
+        J_a, J_b = (J + (J * arms.lean[:, None]).sum(2, keepdims=True) * arms.normal[:, None] for J in (J_a, J_b))
     if arms.turn is not None:  # P + turn x P, by the velocities that it acts on
         mid_a, mid_b = (J - jax.vmap(jax.vmap(so.cross, (None, 0)))(arms.turn, J) for J in (mid_a, mid_b))
 

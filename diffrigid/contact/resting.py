@@ -33,6 +33,7 @@ class Strikes:
     mid_a: Any = array("C", "D", default=None)  # [m] arm of impulses, half the held time before s; None: arm_a
     mid_b: Any = array("C", "D", default=None)
     turn: Any = array("C", "A", default=None)  # [rad] rotation of the impulse at s to where it acts; None: none
+    lean: Any = array("C", "D", default=None)  # [-] change of the normal until changes of velocity act; None: none
     K: Array = array("C", "D", "D")  # [1/kg] effective matrix
     # [m/s] of a against b at the contact point, before the impulse; where gaps are closed (PUSH) the gap along the
     # normal, [m], so that an impulse is [kg m] and changes positions.
@@ -100,7 +101,8 @@ def solve_impulses(
 def _arms(strikes: Strikes) -> Arms:
     return Arms(
         arm_a=strikes.arm_a, arm_b=strikes.arm_b, mid_a=strikes.mid_a, mid_b=strikes.mid_b, turn=strikes.turn,
-        jac=strikes.jac, mid_jac=strikes.mid_jac, spin=strikes.spin, a=strikes.a, b=strikes.b,
+        normal=strikes.normal, lean=strikes.lean, jac=strikes.jac, mid_jac=strikes.mid_jac, spin=strikes.spin,
+        a=strikes.a, b=strikes.b,
     )  # fmt: skip
 
 

@@ -93,12 +93,16 @@ def find_strikes(
 
 
 def _joined(parts: list[Strikes]) -> Strikes:
-    """Concatenate the lists; `turn`, if any has it, is zero in those that do not."""
+    """Concatenate the lists; `turn` and `lean`, if any has them, are zero in those that do not."""
     if len(parts) == 1:
         return parts[0]
     if any(part.turn is not None for part in parts):
-        none = [jnp.zeros_like(part.arm_a[:, : rotations(part.arm_a.shape[1]).A]) for part in parts]
-        parts = [replace(p, turn=zero) if p.turn is None else p for p, zero in zip(parts, none, strict=True)]
+        A = rotations(parts[0].arm_a.shape[1]).A
+        none = [jnp.zeros_like(part.arm_a) for part in parts]
+        parts = [
+            replace(part, turn=zero[:, :A], lean=zero) if part.turn is None else part
+            for part, zero in zip(parts, none, strict=True)
+        ]
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
 
 
@@ -168,7 +172,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
     size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
     T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
-    rolls = ((active & (rests | rested)).sum(0) < len(at_a.x)) & ((s < dt) | (not turns))
+    rolls = (active & near & (rests | rested)).sum(0) < len(at_a.x)
 
     def each(contact: Contacts, moving: Contacts | None, gap: Array) -> Strikes:
         at_gap = replace(contact, gap=jnp.where(apart, contact.gap, 0.0))
@@ -184,7 +188,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
         return Strikes(
             active=gap < 0, s=s, gap=gap, rounding=rounding, deepest=DEEPEST * size, normal=contact.normal,
             arm_a=lever.late_a, arm_b=lever.late_b, mid_a=lever.mid_a, mid_b=lever.mid_b, turn=lever.turn,
-            K=effective_matrix(at_a, at_b, lever), v_rel=v_rel,
+            lean=lever.lean, K=effective_matrix(at_a, at_b, contact.normal, lever), v_rel=v_rel,
             press=-dot(contact.normal, forces), pull=pull, drift=drift, rests=gap < 0, now=meeting.now, held=held,
         )  # fmt: skip
 
