@@ -9,7 +9,7 @@ V corners of a shape, T time steps, B worlds of a batch; trailing batch axes fol
 says so.
 """
 
-from importlib.metadata import version
+from importlib import metadata as _metadata
 
 from diffrigid import paths as paths
 from diffrigid import sysid as sysid
@@ -154,5 +154,5 @@ __all__ = [
 
 def __getattr__(name: str) -> str:
     if name == "__version__":
-        return version("diffrigid")
+        return _metadata.version("diffrigid")
     raise AttributeError(f"module 'diffrigid' has no attribute {name!r}")

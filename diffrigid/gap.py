@@ -23,8 +23,8 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
     Negative where they overlap, then of the deepest contact. For `jit`, `vmap` and `grad`: what a controller sees.
 
     Raises:
-        ValueError: a name that is not there, or twice the same, a body without a shape, two statics, or a `Profile` or
-            `HeightField`, of which a body knows only the parts that it may touch within a step.
+        ValueError: a name that is not there, or twice the same, a body without a shape, two half-spaces, or a `Profile`
+            or `HeightField`, of which a body knows only the parts that it may touch within a step.
 
     Differentiable, with a kink where the closest points jump.
 

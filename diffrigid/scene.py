@@ -33,7 +33,6 @@ from diffrigid.world import Statics, World
 
 TURNING = {"rolling_friction", "spinning_friction"}
 RESERVED = (*COEFFICIENTS, "contact")  # paths, or the first part of one; and "gravity"
-MOST = 1000  # sweeps, or neighbours
 
 
 @in_words
@@ -285,10 +284,6 @@ def _contact(contact: Any) -> Contact:
     if not isinstance(contact, Contact):
         raise ValueError(f"contact is {contact!r}: expected a Contact(width=0.0)")
     refuse_missing(contact, "contact")
-    for name in ("sweeps", "neighbours"):
-        value = getattr(contact, name)
-        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MOST:
-            raise ValueError(f"contact.{name} is {value!r}: expected an integer above 0, up to {MOST}; leave it out")
 
     def check(leaf, letters, path):
         del letters

@@ -113,6 +113,10 @@ def check_kinds(world: Any, state: Any) -> None:
             "both come from `diffrigid.scene`, in this order"
         )
     refuse_missing(state, "state")
+    for name in ("width", "rest_speed"):  # as given with `replace`; arrays came through `scene`
+        value = getattr(world.contact, name)
+        if isinstance(value, int | float) and not value >= 0:
+            raise ValueError(f"contact.{name} is {value:g}: expected 0 or above; 0 turns it off")
     if world.crowd and not traced(world.contact.width) and np.any(np.asarray(world.contact.width) > 0):
         raise ValueError(f"contact.width is {world.contact.width}: expected 0 for so many bodies; use fewer")
     if world.crowd and (world.forces or world.joints):

@@ -411,7 +411,7 @@ def test_what_is_round_slides_and_rolls_over_a_dome(shape):
     """The normal turns: of second order in the step, and so are the slopes."""
     motion, theory = partial(over_a_dome, shape), partial(over_a_dome_in_theory, shape)
     way = with_slopes(motion)
-    for mu, value, slope in ((0.0, 4e-5, 1e-4), (100.0, 1e-5, 1e-4)):
+    for mu, value, slope in ((0.0, 4e-5, 1e-4), (100.0, 2e-5, 1e-4)):
         p = tuple(map(jnp.asarray, (mu, 0.2, 1.0)))
         end, slopes = way(*p)
         assert_allclose(end, theory(*p), atol=value)

@@ -89,7 +89,6 @@ MISTAKES = {
     ),
     "not a force": (r"forces: 'function' is .*: expected a record", {"ball": ball()}, {"forces": [lambda: None]}),
     "width": (r"contact\.width is -1: expected 0 or above", {"ball": ball()}, {"contact": dr.Contact(width=-1.0)}),
-    "sweeps": (r"contact\.sweeps is 0: expected an integer above 0", {"ball": ball()}, {"contact": dr.Contact(sweeps=0)}),
     "missing pair": (
         r"no collision function for Odd with Disc",
         {"ball": ball(), "other": ball(x=(5.0, 1.0))},
@@ -274,3 +273,11 @@ def test_plates_without_thickness_may_lie_side_by_side():
     bodies = {str(k): dr.Body(plate, mass=1.0, x=(1.001 * k, 0.0, 0.0)) for k in range(2)}
     world, state = dr.scene(bodies)
     assert_allclose(dr.gap(world, state, "0", "1"), 0.001, atol=1e-12)
+
+
+def test_a_contact_is_checked_where_it_is_made_or_replaced():
+    with pytest.raises(ValueError, match=r"contact\.sweeps is 0: expected an integer above 0"):
+        dr.Contact(sweeps=0)
+    world, state = dr.scene({"ball": ball()})
+    with pytest.raises(ValueError, match=r"contact\.width is -0\.1: expected 0 or above"):
+        dr.step(dr.replace(world, contact=dr.Contact(width=-0.1)), state, 1e-2)

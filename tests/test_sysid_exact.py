@@ -514,6 +514,18 @@ def test_profile_agrees_with_the_jacobian_where_the_problem_is_nearly_linear():
     assert repr(dr.profile(doubtful, "spring.stiffness")).splitlines()[0].endswith("(profile; the cost jumps)")
 
 
+def test_noise_may_be_missing_where_the_column_is():
+    """NaN in both, as a table has them; the noise of a column is then the median of what is there."""
+    fall = record(np.random.default_rng(3), 30, 0.0)
+    missing = np.isnan(fall.observations["p.x"])
+    noise = {"p.x": np.where(missing, np.nan, NOISE)}
+    free = {"p.x": dr.real(), "p.v": dr.real()}
+    found = dr.fit(*point(), [replace(fall, noise=noise)], free=free, progress=False)
+    expected = dr.fit(*point(), [fall], free=free, noise={"p.x": NOISE}, progress=False)
+    assert found.noise == {"p.x": NOISE}
+    assert_allclose(found["p.v"].low, expected["p.v"].low, rtol=1e-9)
+
+
 def test_profile_of_a_component():
     """A fall is linear in its start and velocity, so that intervals are those of the Jacobian."""
     fall = record(np.random.default_rng(7), 30, 0.0)

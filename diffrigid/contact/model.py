@@ -57,6 +57,7 @@ from diffrigid.state import State
 if TYPE_CHECKING:
     from diffrigid.world import World
 
+MOST = 1000  # sweeps, or neighbours
 IMPACT, HOLD, WEIGH, REVERSE, PUSH = range(5)
 LEFT = 1e-3  # [-] of the way of a fall in a step: a gap that passes before may have left at contacts that rest
 HOLDS = 6  # passes to hold resting contacts until the first impact: for most of its time in free fall, then from there
@@ -90,6 +91,14 @@ class Contact:
     rest_speed: Leaf = array(default=1e-3)
     sweeps: int = static(default=4)
     neighbours: int = static(default=8)
+
+    def __post_init__(self) -> None:
+        for name in ("sweeps", "neighbours"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MOST:
+                raise ValueError(
+                    f"contact.{name} is {value!r}: expected an integer above 0, up to {MOST}; leave it out"
+                )
 
     def __call__(self, world: "World", state: State, launch: Callable, dt: Array) -> State:
         """State after a step of length dt (*batch) [s].

@@ -23,6 +23,7 @@ from diffrigid.sysid.problem import Group, Plan, residuals_of
 
 ARMIJO = 1e-4  # [-] of the decrease predicted by the slope: what a step of L-BFGS has to achieve
 HALVINGS = 20
+SETTLED = 1e-4  # [-] relative decrease of the cost in the last tenth of the steps of an optimiser, at most
 LBFGS_SETTLED = 1e-10  # [-] relative decrease of the cost at which it ends
 
 
@@ -38,17 +39,21 @@ def first_order(optimiser: optax.GradientTransformation, steps: int = 500) -> Ca
 
     def solve(groups, z, loss, iterations, reach, report) -> tuple[Point, str]:
         state, best, move = optimiser.init(z), None, jax.jit(_as_optax_does(optimiser.update))
+        most, lowest = steps if iterations is None else iterations, []
         try:
-            for count in range(steps if iterations is None else iterations):
+            for count in range(most):
                 cost, slope = cost_and_slope(groups, z, loss)
                 best = _best(best, (cost, z))
                 report(count, np.asarray(best[0]))
+                lowest.append(float(best[0].min()))
                 change, state = move(_held(slope, reach), state, z)
                 z = jax.tree.map(jnp.add, z, change)
         except KeyboardInterrupt:
             return point_at(groups, best[1] if best else z), INTERRUPTED
         best = _best(best, (cost_and_slope(groups, z, loss)[0], z))
-        return point_at(groups, best[1]), ""
+        end = float(best[0].min())
+        settled = bool(lowest) and lowest[-1 - most // 10] - end <= SETTLED * abs(end)
+        return point_at(groups, best[1]), "" if settled else UNFINISHED.format(most)
 
     return solve
 
@@ -77,7 +82,7 @@ def lbfgs(steps: int = 200, memory: int = 10) -> Callable:
                 gradient = _flat(_held(slope, reach))
                 change, state = _direction(scale, gradient, state, flat)
                 flat, new, slope = _line_search(groups, z, loss, flat, -change, cost, gradient)
-                ended = cost - new <= LBFGS_SETTLED * jnp.abs(cost)
+                ended = ~(cost - new > LBFGS_SETTLED * jnp.abs(cost))  # also one that diverged: inf - inf is NaN
                 cost = new
                 if bool(ended.all()):
                     break

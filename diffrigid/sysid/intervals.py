@@ -175,11 +175,12 @@ def _scattered(problem: Problem) -> list[str]:
 def _worst(residuals: Sequence[dict[str, np.ndarray]]) -> list[str]:
     """Remark on records whose residuals are much larger than those of most."""
     parts = [np.concatenate([column.ravel() for column in record.values()]) for record in residuals]
-    sizes = np.array([np.sqrt(np.mean(part[np.isfinite(part)] ** 2)) for part in parts])
-    worst = np.flatnonzero(sizes > OUTSTANDING * np.median(sizes))
+    sizes = np.array([np.sqrt(np.nanmean(part**2)) if np.isfinite(part).any() else np.nan for part in parts])
+    most = np.nanmedian(sizes)
+    worst = np.flatnonzero(sizes > OUTSTANDING * most)
     if not len(worst):
         return []
-    named = ", ".join(f"{k} ({sizes[k] / np.median(sizes):.2g} times)" for k in worst[:3])
+    named = ", ".join(f"{k} ({sizes[k] / most:.2g} times)" for k in worst[:3])
     return [f"residuals are larger than in most records in {named}{', ...' if len(worst) > 3 else ''}"]
 
 

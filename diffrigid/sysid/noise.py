@@ -92,5 +92,5 @@ def all_noise(problem: Problem) -> dict[str, float]:
     noise = dict(problem.noise)
     for run in problem.runs:
         for name in run.channels:
-            noise.setdefault(name, float(np.median(run.noise[name])) if name in run.noise else np.nan)
+            noise.setdefault(name, float(np.nanmedian(run.noise[name])) if name in run.noise else np.nan)
     return noise

@@ -96,7 +96,7 @@ def beside_a_jump(problem: Problem, point: Point, best: int, linear: Linear, los
     a = linear.shared
     g = np.stack([slopes.T @ rows for slopes, rows in zip(linear.slopes, linear.rows, strict=True)])  # (R, a + b)
     h = np.stack([(slopes**2).sum(0) for slopes in linear.slopes])
-    noise = [*problem.noise.values(), *(np.min(sigma) for run in problem.runs for sigma in run.noise.values())]
+    noise = [*problem.noise.values(), *(np.nanmin(sigma) for run in problem.runs for sigma in run.noise.values())]
     if not np.isfinite(h).all() or np.sqrt(h.max(initial=0.0)) * min(noise) > WILD:
         return [
             "the slopes of the residuals are enormous: the motion is unstable, or chaotic; make dt smaller, or begin "

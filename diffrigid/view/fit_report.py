@@ -80,13 +80,17 @@ def motion_player(fit: "Fit", motions: Sequence[Trajectory]) -> Player:
 
 def measured(fit: "Fit", record: int) -> dict[str, Any]:
     """Columns of a record that are parts of a state, by what they observe, corrected for bias, scale and clock."""
-    scene, out = fit.scenes[record], {}
+    scene = fit.scenes[record]
+    out: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for series in fit.problem.runs[record].series:
         channel = scene.channels[series.name]
         if isinstance(channel.observer, Part):
             name = f"{scene.world.names[channel.observer.body]}.{channel.observer.field}"
             bias, scale, clock = (np.asarray(leaf, float) for leaf in (channel.bias, channel.scale, channel.clock))
-            out[name] = (series.t - clock, (series.values - bias) / scale)
+            seen = out.get(name, (np.zeros(0), np.zeros((0, series.values.shape[1]))))  # by another instrument
+            t, values = map(np.concatenate, zip(seen, (series.t - clock, (series.values - bias) / scale), strict=True))
+            order = np.argsort(t, kind="stable")
+            out[name] = (t[order], values[order])
     return out
 
 
