@@ -12,7 +12,8 @@ gap, the normal velocity J v has changed by
     J u + (T/2) (d(J v)/dx) u = (J + (T/2) dJ/dt) u
 
 because second derivatives of a gap are symmetric: the change u acts at the arms, and along the normal, of T/2 after the
-end. So it is for what is free to turn, not for what lies flat. A slip is measured at these arms, too, but along the
+end. So it is for what is free to turn, not for what lies flat; and between two moving bodies only until an impact, since
+at the end of a step they would lose or gain twice the energy. A slip is measured at these arms, too, but along the
 tangents of the end: as these turn they take up the normal velocity that is left, which is zero. What in space the
 change of pose adds to the precession of a spin is left out.
 """
