@@ -12,10 +12,10 @@ gap, the normal velocity J v has changed by
     J u + (T/2) (d(J v)/dx) u = (J + (T/2) dJ/dt) u
 
 because second derivatives of a gap are symmetric: the change u acts at the arms, and along the normal, of T/2 after the
-end. So it is for what is free to turn, not for what lies flat; and between two moving bodies only until an impact, since
-at the end of a step they would lose or gain twice the energy. A slip is measured at these arms, too, but along the
-tangents of the end: as these turn they take up the normal velocity that is left, which is zero. What in space the
-change of pose adds to the precession of a spin is left out.
+end. So it is for what is free to turn on what does not move, not for what lies flat; between two moving bodies it would
+double what they gain or lose of their energy. A slip is measured at these arms, too, but along the tangents of the end:
+as these turn they take up the normal velocity that is left, which is zero. What in space the change of pose adds to the
+precession of a spin is left out.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ class Levers:
 
     arm_a: Array = array("D")  # at the end
     arm_b: Array = array("D")
-    late_a: Array = array("D")  # of changes of velocity: T/2 after the end, or as at the end
+    late_a: Array = array("D")  # of changes of velocity: T/2 after the end where it rolls, else as at the end
     late_b: Array = array("D")
     mid_a: Any = array("D", default=None)  # of impulses, T/2 before the end; None: all are the same
     mid_b: Any = array("D", default=None)
@@ -61,7 +61,7 @@ def levers(
         turns: whether the normal may turn.
         drift: (D, *batch) [m/s] half the velocity of centre a relative to centre b; 0 at a static.
         T: (*batch) [s] time for which it is held, else 0.
-        rolls: (*batch) bool: changes of velocity act late.
+        rolls: (*batch) bool: changes of velocity act late, on a static.
     """
     normal, point, gap = contact.normal, contact.point, contact.gap
     inside = 0.5 * gap[None] * normal
@@ -83,8 +83,7 @@ def levers(
         turn = -half * rotations(len(normal)).moment(normal, moving.normal)
         turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
         lean = jnp.where(rolls[None], rotations(len(normal)).cross(-turn, normal), 0.0)
-    apart = half * drift if both_move else jnp.zeros_like(drift)
-    ways = _less_spin(normal, ends, (turned - apart, turned + apart), (at_a, at_b), limit * half)
+    ways = _less_spin(normal, ends, turned, (at_a, at_b), limit * half)
     late_a, late_b = (end + jnp.where(rolls[None], way, 0.0) for end, way in zip(ends, ways, strict=True))
     return Levers(
         arm_a=ends[0], arm_b=ends[1], late_a=late_a, late_b=late_b, mid_a=mids[0] - turned, mid_b=mids[1] - turned,
@@ -92,16 +91,16 @@ def levers(
     )  # fmt: skip
 
 
-def _less_spin(normal: Array, arms: tuple, ways: tuple, at: tuple, span: Array) -> list[Array]:
-    """The ways [m] of two arms in a span [s] without what a spin about the normal adds, which only turns the slip:
-    friction is against that at the end. In the plane there is no such spin."""
+def _less_spin(normal: Array, arms: tuple, way: Array, at: tuple, span: Array) -> list[Array]:
+    """The way [m] of each of two arms in a span [s] without what a spin about the normal adds, which only turns the
+    slip: friction is against that at the end. In the plane there is no such spin."""
     if len(normal) == 2:
-        return list(ways)
+        return [way, way]
     spins = [
         jnp.zeros_like(arm) if one.w is None else dot(normal, one.w)[None] * rotations(3).cross(normal, arm)
         for arm, one in zip(arms, at, strict=True)
     ]
-    return [way - span * spin for way, spin in zip(ways, spins, strict=True)]
+    return [way - span * spin for spin in spins]
 
 
 def with_rates(

@@ -172,7 +172,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
     size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
     T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
-    rolls = ((active & near & (rests | rested)).sum(0) < len(at_a.x)) & ((s < dt) | (not both_move))
+    rolls = ((active & near & (rests | rested)).sum(0) < len(at_a.x)) & (not both_move)
 
     def each(contact: Contacts, moving: Contacts | None, gap: Array) -> Strikes:
         at_gap = replace(contact, gap=jnp.where(apart, contact.gap, 0.0))
