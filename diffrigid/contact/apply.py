@@ -19,6 +19,7 @@ from diffrigid.contact.mobility import (
     Mobility,
     answers_of_forces,
     jointed,
+    mids,
     momentum_changes,
     relative_changes,
     velocities,
@@ -86,7 +87,8 @@ def apply_impulses(
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     friction = None
     if known is not None:
-        in_trial = rolling_reversing if is_rolling(world) else partial(reversing, weighs=known.trial is not None)
+        began = None if known.trial is None else _began(flight, strikes)
+        in_trial = rolling_reversing if is_rolling(world) else partial(reversing, began=began)
         friction = in_trial(mobility, strikes, P, (dv, dw), law, held_for, world.contact.rest_speed)
         if known.trial is not None:
             friction = choose(weighs, weighed(mobility, unsolved[0], P, known, unsolved[1], held_for), friction)
@@ -106,6 +108,18 @@ def apply_impulses(
     # The new path of a body that was held, followed backwards, agrees with its true path to second order.
     since = jnp.where(count > 0, jnp.where(holds, flight.t0, t), anchors.since)
     return _anchored(flight, t, q, since, kicked, moved), friction, load
+
+
+def _began(flight: Flight, strikes: Strikes) -> Array:
+    """Relative velocities at all contacts where the paths of their bodies begin, (C, D, *batch) [m/s]."""
+    so = rotations(flight.dim)
+
+    def twist(f: Flight) -> tuple[Array, Array]:
+        q, L = orientation(f, f.t0), angular_momentum(f, f.t0)
+        return velocity(f, f.t0), so.apply(so.world_inverse(f.inverse_inertia, q), L)
+
+    arm_a, arm_b = (2.0 * mid - end for mid, end in zip(mids(strikes), (strikes.arm_a, strikes.arm_b), strict=True))
+    return relative_changes(replace(strikes, arm_a=arm_a, arm_b=arm_b), *jax.vmap(twist)(flight))
 
 
 def _at_their_times(strikes: Strikes, P: Array, t: Array, mobility: Mobility, kick: Array) -> tuple[Array, Array]:

@@ -67,7 +67,7 @@ def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tupl
 
 def reversing(
     mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array,
-    rest_speed: Array, by_torques: Array | float = 0.0, weighs: bool = False,
+    rest_speed: Array, by_torques: Array | float = 0.0, began: Array | None = None,
 ) -> Known:  # fmt: skip
     """Friction where a slip stops and reverses within T, from trial impulses P with friction acting one way.
 
@@ -76,7 +76,8 @@ def reversing(
     Args:
         changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P and by torques of rolling rows.
         by_torques: (C, D, *batch) [m/s] what v_rel gains by the latter, which `strikes` have already.
-        weighs: only name the contacts where friction may reverse, for `weighed`; rows of joints as ever.
+        began: (C, D, *batch) [m/s] relative velocities when contacts began to be held. If given, only name those where
+            friction may reverse, for `weighed`; rows of joints as ever.
     """
     held, heaviest = strikes.active & strikes.held & (T > 0), most_resisting(mobility, strikes)
 
@@ -101,26 +102,29 @@ def reversing(
             light = light | jnp.isfinite(law.most)
         drag = jnp.where(light, bound * per_impulse, 0.0)
         turned, early, turns = reversal(slip, at_end, bounds, drag, stops, T)
-        if not weighs:
+        if began is None:
             return Known(P=turned, early=early, rubs=turns.astype(T.dtype))
         of_joint = jnp.zeros_like(held) if law.most is None else jnp.isfinite(law.most)
         left = strikes.v_rel + relative_changes(strikes, *changes)
-        maybe = held & _stops(strikes, T, left, rest_speed) & (rubbed != 0).any(1)
+        maybe = held & _stops(strikes, began, left, rest_speed) & (rubbed != 0).any(1)
         turned, early = (jnp.where(of_joint[:, None], part, 0.0) for part in (turned, early))
         return Known(P=turned, early=early, rubs=jnp.where(of_joint, turns, maybe).astype(T.dtype), trial=P)
 
     def nothing(P: Array, changes: tuple[Array, Array], law: Law) -> Known:
         del changes, law
         none = jnp.zeros_like(P)
-        return Known(P=none, early=none, rubs=jnp.zeros_like(T), trial=none if weighs else None)
+        return Known(P=none, early=none, rubs=jnp.zeros_like(T), trial=None if began is None else none)
 
     return lax.cond(any_world(held), found, nothing, P, changes, law)
 
 
-def _stops(strikes: Strikes, T: Array, left: Array, rest_speed: Array) -> Array:
-    """Whether a slip of contacts that ends as `left` (C, D, *batch) [m/s] stops within T, (C, *batch) bool."""
-    slip = split(strikes.normal, strikes.v_rel - T[:, None] * strikes.pull)[1]
-    speed, onwards = jax.vmap(norm)(slip), jax.vmap(dot)(split(strikes.normal, left)[1], slip)
+def _stops(strikes: Strikes, began: Array, left: Array, rest_speed: Array) -> Array:
+    """Whether a slip of contacts that began and is `left`, (C, D, *batch) [m/s], has stopped between, (C, *batch) bool.
+
+    What the pull tells of the beginning would not do: it is off by more than the slip of what rests.
+    """
+    slip, after = (split(strikes.normal, r)[1] for r in (began, left))
+    speed, onwards = jax.vmap(norm)(slip), jax.vmap(dot)(after, slip)
     return (speed > least_slip(rest_speed)[None]) & (onwards <= STOPPED * speed**2)
 
 
