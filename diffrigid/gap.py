@@ -26,8 +26,8 @@ def gap(world: World, state: State, a: str, b: str) -> Array:
         ValueError: a name that is not there, or twice the same, a body without a shape, two half-spaces, or a `Profile`
             or `HeightField`, of which a body knows only the parts that it may touch within a step.
 
-    Differentiable, with a kink where the closest points jump. At least 0.4 % of their size where a corner of one shape
-    lies in the plane of a face of the other, beside that face: as a contact it then counts as not yet there.
+    Differentiable, with a kink where the closest points jump. At least 0.4 % of the radius of the smaller shape where
+    a corner of one lies in the plane of a face of the other, beside it: as a contact it then counts as not yet there.
 
     Example:
         >>> round(float(dr.gap(world, state, "ball", "floor")), 6)  # from a height of 1 m, less the radius

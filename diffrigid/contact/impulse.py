@@ -71,6 +71,8 @@ def effective_matrix(at_a: Placed, at_b: Placed, normal: Array, lever: Levers) -
     if lever.turn is None:
         return K
     K = K - jax.vmap(lambda row: rotations(len(K)).cross(lever.turn, row))(K)
+    if lever.lean is None:
+        return K
     return K + normal[:, None] * matvec(jnp.swapaxes(K, 0, 1), lever.lean)[None]
 
 

@@ -61,7 +61,7 @@ def levers(
         turns: whether the normal may turn.
         drift: (D, *batch) [m/s] half the velocity of centre a relative to centre b; 0 at a static.
         T: (*batch) [s] time for which it is held, else 0.
-        rolls: (*batch) bool: changes of velocity act late, on a static.
+        rolls: (*batch) bool: changes of velocity act late; not between two moving bodies.
     """
     normal, point, gap = contact.normal, contact.point, contact.gap
     inside = 0.5 * gap[None] * normal
@@ -82,9 +82,12 @@ def levers(
     if turns:
         turn = -half * rotations(len(normal)).moment(normal, moving.normal)
         turn = turn / (1.0 + 4.0 * dot(turn, turn))[None]  # likewise
-        lean = jnp.where(rolls[None], rotations(len(normal)).cross(-turn, normal), 0.0)
-    ways = _less_spin(normal, ends, turned, (at_a, at_b), limit * half)
-    late_a, late_b = (end + jnp.where(rolls[None], way, 0.0) for end, way in zip(ends, ways, strict=True))
+        if not both_move:
+            lean = jnp.where(rolls[None], rotations(len(normal)).cross(-turn, normal), 0.0)
+    late_a, late_b = ends
+    if not both_move:
+        ways = _less_spin(normal, ends, turned, (at_a, at_b), limit * half)
+        late_a, late_b = (end + jnp.where(rolls[None], way, 0.0) for end, way in zip(ends, ways, strict=True))
     return Levers(
         arm_a=ends[0], arm_b=ends[1], late_a=late_a, late_b=late_b, mid_a=mids[0] - turned, mid_b=mids[1] - turned,
         turn=turn, lean=lean, rate=rate,

@@ -60,7 +60,7 @@ def with_rows(
     mid, turn = None if strikes.mid_a is None else none, None if strikes.turn is None else none[:, : so.A]
     rows = Strikes(
         active=strikes.active[:count], s=strikes.s[:count], gap=zero, rounding=zero, deepest=zero, normal=along,
-        arm_a=none, arm_b=none, mid_a=mid, mid_b=mid, turn=turn, lean=None if turn is None else none,
+        arm_a=none, arm_b=none, mid_a=mid, mid_b=mid, turn=turn, lean=None if strikes.lean is None else none,
         K=_mobility_of_turns(mobility, a, b, so),
         v_rel=kick * turns(w), press=zero, pull=turns(pull), drift=none, rests=strikes.rests[:count],
         now=strikes.now[:count], held=strikes.held[:count],

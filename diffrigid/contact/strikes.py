@@ -96,13 +96,12 @@ def _joined(parts: list[Strikes]) -> Strikes:
     """Concatenate the lists; `turn` and `lean`, if any has them, are zero in those that do not."""
     if len(parts) == 1:
         return parts[0]
-    if any(part.turn is not None for part in parts):
-        A = rotations(parts[0].arm_a.shape[1]).A
-        none = [jnp.zeros_like(part.arm_a) for part in parts]
-        parts = [
-            replace(part, turn=zero[:, :A], lean=zero) if part.turn is None else part
-            for part, zero in zip(parts, none, strict=True)
-        ]
+    for name, axes in (("turn", rotations(parts[0].arm_a.shape[1]).A), ("lean", None)):
+        if any(getattr(part, name) is not None for part in parts):
+            parts = [
+                replace(part, **{name: jnp.zeros_like(part.arm_a[:, :axes])}) if getattr(part, name) is None else part
+                for part in parts
+            ]
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
 
 
@@ -172,7 +171,7 @@ def strikes_of(a: Side, b: Side, meeting: Meeting, rested: Array, dt: Array, loa
     drift = 0.5 * (at_a.v - at_b.v) if both_move else jnp.zeros_like(at_a.x)  # type: ignore[operator]
     size, rounding = smaller_size(a, b), gap_rounding(a, at_a, b, at_b)
     T, turns = jnp.where(held, s - began(a, b), 0.0), both_move or not isinstance(b.shape, HalfSpace)
-    rolls = ((active & near & (rests | rested)).sum(0) < len(at_a.x)) & (not both_move)
+    rolls = (active & near & (rests | rested)).sum(0) < len(at_a.x)
 
     def each(contact: Contacts, moving: Contacts | None, gap: Array) -> Strikes:
         at_gap = replace(contact, gap=jnp.where(apart, contact.gap, 0.0))
