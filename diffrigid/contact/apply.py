@@ -87,7 +87,7 @@ def apply_impulses(
     dv, dw, dL = velocities(mobility, *momentum_changes(strikes, P, moving))
     friction = None
     if known is not None:
-        began = None if known.trial is None else _began(flight, strikes)
+        began = None if known.trial is None else partial(_began, flight, strikes)
         in_trial = rolling_reversing if is_rolling(world) else partial(reversing, began=began)
         friction = in_trial(mobility, strikes, P, (dv, dw), law, held_for, world.contact.rest_speed)
         if known.trial is not None:

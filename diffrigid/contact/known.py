@@ -10,6 +10,7 @@ Loads                    A loaded contact must not move, in either direction. Th
                          contact when the body turned within the step.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -67,7 +68,7 @@ def beside(mobility: Mobility, strikes: Strikes, law: Law, known: Known) -> tupl
 
 def reversing(
     mobility: Mobility, strikes: Strikes, P: Array, changes: tuple[Array, Array], law: Law, T: Array,
-    rest_speed: Array, by_torques: Array | float = 0.0, began: Array | None = None,
+    rest_speed: Array, by_torques: Array | float = 0.0, began: Callable | None = None,
 ) -> Known:  # fmt: skip
     """Friction where a slip stops and reverses within T, from trial impulses P with friction acting one way.
 
@@ -76,8 +77,8 @@ def reversing(
     Args:
         changes: of v (N, D, *batch) [m/s] and w (N, A, *batch) [rad/s], by P and by torques of rolling rows.
         by_torques: (C, D, *batch) [m/s] what v_rel gains by the latter, which `strikes` have already.
-        began: (C, D, *batch) [m/s] relative velocities when contacts began to be held. If given, only name those where
-            friction may reverse, for `weighed`; rows of joints as ever.
+        began: gives relative velocities when contacts began to be held, (C, D, *batch) [m/s]. If given, only name those
+            where friction may reverse, for `weighed`; rows of joints as ever.
     """
     held, heaviest = strikes.active & strikes.held & (T > 0), most_resisting(mobility, strikes)
 
@@ -106,7 +107,7 @@ def reversing(
             return Known(P=turned, early=early, rubs=turns.astype(T.dtype))
         of_joint = jnp.zeros_like(held) if law.most is None else jnp.isfinite(law.most)
         left = strikes.v_rel + relative_changes(strikes, *changes)
-        maybe = held & _stops(strikes, began, left, rest_speed) & (rubbed != 0).any(1)
+        maybe = held & _stops(strikes, began(), left, rest_speed) & (rubbed != 0).any(1)
         turned, early = (jnp.where(of_joint[:, None], part, 0.0) for part in (turned, early))
         return Known(P=turned, early=early, rubs=jnp.where(of_joint, turns, maybe).astype(T.dtype), trial=P)
 

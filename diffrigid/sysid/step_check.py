@@ -32,8 +32,8 @@ from diffrigid.world import World
 FAR = 1.0  # [-] of a standard deviation: numbers that move by more with steps half as long are doubted
 LOOK = 0.3  # [-] likewise in the first half, with the deviations that it would give: more is worth the whole
 LEAST = 1e-5  # [-] of a large change of a number: less does not matter, however well it is known
-SHORTER, ENOUGH = 0.25, 0.25  # [-] of the step, at most, and of a deviation: a step so short is proposed that its
-# error, of second order, is no more than that
+# [-] of the step, at most, and of a deviation: the step that is proposed has an error, of second order, below that.
+SHORTER, ENOUGH = 0.25, 0.25
 
 
 def too_long(
